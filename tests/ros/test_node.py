@@ -357,7 +357,7 @@ def test_a_clock_that_jumps_ahead_is_no_event(network, robot, scans):
 
 
 def test_messages_that_come_too_fast_are_counted(network, robot, scans, monkeypatch):
-    monkeypatch.setattr(node_module, "_LONGEST_INBOX", 5)
+    monkeypatch.setattr(node_module, "MOST_WAITING_BYTES", 2_000)
     said = []
     start(network, robot, said.append)
     plays(network, scans[:10])

@@ -11,13 +11,14 @@ import pytest
 from fcslam.cli import main
 from fcslam.errors import NetworkError, OutputError
 from fcslam.records import LaserScan
+from fcslam.ros.inbox import Inbox
 from fcslam.ros.node import await_sensors
-from fcslam.ros.record import _Inbox, record
+from fcslam.ros.record import record
 from fcslam.ros.ros2 import INSTALL, Ros2Network
 from fcslam.sources import BagOptions, open_source
 from fcslam.sources.bags.codec import MULTI_ECHO_SCAN, ODOMETRY, SCAN, TRANSFORMS
 from tests.ros.memory_network import MemoryNetwork, offered
-from tests.ros.ros_messages import multi_echo, odometry, scan, transform
+from tests.ros.ros_messages import encoded, multi_echo, odometry, scan, transform
 
 RANGES = [5.0] * 180
 
@@ -102,16 +103,17 @@ def test_a_full_disk_keeps_what_was_recorded_before(tmp_path):
     assert 200 < open_source(part).survey().scan_count < 399
 
 
-def test_messages_that_the_disk_cannot_take_are_counted(monkeypatch):
-    monkeypatch.setattr("fcslam.ros.record.LARGEST_INBOX_BYTES", 250)
-    inbox = _Inbox()
-    for number in range(4):
-        inbox.put("/image", number, bytes(100))
-    assert inbox.lost == 2
-    assert inbox.get(0.0)[1] == 0
-    inbox.put("/image", 4, bytes(100))
-    assert [inbox.get(0.0)[1] for _ in range(2)] == [1, 4]
-    assert (inbox.lost, inbox.is_empty) == (2, True)
+def test_messages_that_the_reader_cannot_take_are_counted():
+    network, losses = MemoryNetwork(), []
+    inbox = Inbox(2 * len(encoded(SCAN, scan(1.0, RANGES))), lambda: losses.append(1))
+    inbox.subscribe(network, {"/scan": SCAN}, {}, iter(range(9)).__next__)
+    for stamp in range(4):
+        network.say("/scan", SCAN, scan(stamp, RANGES))
+    assert (inbox.lost, len(losses)) == (2, 2)
+    assert inbox.get(0.0).received_ns == 0
+    network.say("/scan", SCAN, scan(4.0, RANGES))
+    assert [inbox.get(0.0).received_ns for _ in range(2)] == [1, 2]
+    assert (inbox.lost, inbox.get(0.0)) == (2, None)
 
 
 def test_a_missing_middleware_is_told_with_the_command_that_installs_it(monkeypatch):

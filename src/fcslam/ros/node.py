@@ -9,8 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,15 +20,16 @@ from fcslam.errors import FcslamError, NetworkError
 from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
 from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock
+from fcslam.ros.inbox import Inbox
 from fcslam.ros.network import Answer, Endpoint, Quality, RosNetwork, qos_conflict
 from fcslam.ros.outputs import MAP, OWN_MAP, POSE, Outputs, nanoseconds
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.sensors import LiveSensors, Notify
-from fcslam.ros.topics import TF_STATIC, SensorTopics, choose_sensor_topics, resolved
+from fcslam.ros.topics import SensorTopics, choose_sensor_topics, resolved
 from fcslam.ros.transform_stream import TransformStream
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, LASER_SCANS, SCANS, MessageCodec
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.transforms import last_part, planar, transform_of
+from fcslam.sources.bags.transforms import planar, transform_of
 from fcslam.storage.files import write_file
 
 if TYPE_CHECKING:
@@ -41,8 +40,8 @@ if TYPE_CHECKING:
 
 STRING, EMPTY = "std_msgs/String", "std_msgs/Empty"
 SAVE_MAP, FINISH, FLOOR, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "fcslam/floor", "initialpose"
-_LONGEST_INBOX = 20_000
-"""Most messages that wait to be read; beyond, newer ones are lost."""
+MOST_WAITING_BYTES = 64_000_000
+"""Of messages that wait to be read; beyond, newer ones are lost."""
 _COMMANDS_WAITING = 8
 """Most commands that wait; anybody on the network may send them."""
 _LINES_TOLD = 1000
@@ -54,15 +53,6 @@ _SETTLES_FOR_ODOMETRY = 4
 _SILENCE_S = 2.0
 """A longer pause of the scans is reported."""
 _DEPTHS = {**dict.fromkeys((*SCANS, COMPRESSED_IMAGE, IMAGE), 10), **dict.fromkeys(LASER_SCANS, 100), CAMERA_INFO: 1}
-_DEPTH = 1000
-"""Messages that the middleware keeps for this process; of odometry and tf there are many."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Message:
-    topic: str
-    payload: bytes
-    received_ns: int
 
 
 def await_sensors(
@@ -116,11 +106,14 @@ class RobotNode:
         self._robot, self._parameters, self._notify = robot, parameters, notify
         self._suggest_pose, self._change_floor = suggest_pose, change_floor
         self._codec = MessageCodec(ros1=False)
-        self._inbox: queue.SimpleQueue[_Message] = queue.SimpleQueue()
+        self._inbox = Inbox(
+            MOST_WAITING_BYTES,
+            lambda: self._tell_once("messages come faster than this computer can map; some are lost"),
+        )
         self._commands: queue.Queue[tuple[Callable[[], Answer], Future[Answer]]] = queue.Queue(_COMMANDS_WAITING)
         self._stop = threading.Event()
         self._told: set[str] = set()
-        self.scans = self._lost_messages = 0
+        self.scans = 0
         self._pose: RobotPose | None = None
         self._state: tuple[bool, float] | None = None
         """Whether the robot knows its pose in the map, and since which stamp."""
@@ -152,9 +145,7 @@ class RobotNode:
         is_silent = False
         try:
             while not self._stop.is_set():
-                message: _Message | None = None
-                with suppress(queue.Empty):
-                    message = self._inbox.get(timeout=_POLL_S)
+                message = self._inbox.get(_POLL_S)
                 now_s = time.monotonic()
                 before = self.scans
                 records = (
@@ -307,7 +298,7 @@ class RobotNode:
         else:
             since = f"for {max(0.0, pose.stamp - state[1]):.0f} s"
             trouble, well = "" if state[0] else f"not localized {since}", f"localized {since}"
-        values: dict[str, object] = {"scans": self.scans, "messages lost": self._lost_messages}
+        values: dict[str, object] = {"scans": self.scans, "messages lost": self._inbox.lost}
         if pose is not None:
             values |= {"quality": f"{pose.quality:.3f}", "map": pose.map_index, "stamp": f"{pose.stamp:.3f}"}
         faults = self.sensors.audit.faults()
@@ -315,13 +306,7 @@ class RobotNode:
         self._outputs.diagnostics(self._clock.now_ns(), self._robot.name, trouble, values, well)
 
     def _subscribe(self) -> None:
-        offered = [point for point in self._network.endpoints() if point.publishes]
-        for topic, kind in self._topics.kinds.items():
-            # Ask for reliable messages where all publishers offer them: then none is lost.
-            reliable = all(point.quality.reliable for point in offered if point.topic == topic)
-            latched = last_part(topic) == TF_STATIC
-            quality = Quality(reliable or latched, latched, _DEPTHS.get(kind, _DEPTH))
-            self._network.subscribe(topic, kind, quality, partial(self._deliver, topic))
+        self._inbox.subscribe(self._network, self._topics.kinds, _DEPTHS, self._clock.now_ns)
         commands: list[tuple[str, str, Callable[[bytes], object]]] = [
             (SAVE_MAP, STRING, lambda payload: self._ask(partial(self._save_map, payload))),
             (FINISH, EMPTY, lambda _: self.stop()),
@@ -336,13 +321,6 @@ class RobotNode:
             self._network.subscribe(
                 CLOCK_TOPIC, CLOCK, Quality(reliable=False), lambda payload: self._clock.tick(payload, self._codec)
             )
-
-    def _deliver(self, topic: str, payload: bytes) -> None:
-        if self._inbox.qsize() < _LONGEST_INBOX:
-            self._inbox.put(_Message(topic, payload, self._clock.now_ns()))
-            return
-        self._lost_messages += 1
-        self._tell_once("messages come faster than this computer can map; some are lost")
 
     def _ask(self, command: Callable[[], Answer]) -> Future[Answer]:
         """Obey a command later."""

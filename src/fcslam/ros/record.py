@@ -1,6 +1,5 @@
 """Records what a robot publishes into a file that `fcslam map` reads: the messages as they come, undecoded."""
 
-import queue
 import threading
 import time
 from collections import Counter
@@ -12,17 +11,14 @@ from typing import Any
 
 from fcslam.errors import OutputError
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC
-from fcslam.ros.network import Quality, RosNetwork
+from fcslam.ros.inbox import Inbox, ReceivedMessage
+from fcslam.ros.network import RosNetwork
 from fcslam.ros.sensors import Notify
-from fcslam.ros.topics import TF_STATIC, SensorTopics
+from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.codec import full_name, typestore
 from fcslam.sources.bags.mcap_records import end_mcap
-from fcslam.sources.bags.transforms import last_part
 
 _POLL_S = 0.2
-_DEPTH = 1000
-LARGEST_INBOX_BYTES = 256_000_000
-"""Most bytes that wait for the disk; beyond, the next messages are lost."""
 
 
 def record(
@@ -39,18 +35,9 @@ def record(
     Raises:
         OutputError: the file cannot be written; the message names the file that is kept.
     """
-    inbox = _Inbox()
+    inbox = Inbox()
     kinds = {**topics.kinds, CLOCK_TOPIC: CLOCK}
-    offered = [point for point in network.endpoints() if point.publishes]
-    for topic, kind in kinds.items():
-        reliable = [point.quality.reliable for point in offered if point.topic == topic]
-        latched = last_part(topic) == TF_STATIC
-        quality = Quality((bool(reliable) and all(reliable)) or latched, latched, _DEPTH)
-
-        def deliver(payload: bytes, topic: str = topic) -> None:
-            inbox.put(topic, time.time_ns(), payload)
-
-        network.subscribe(topic, kind, quality, deliver)
+    inbox.subscribe(network, kinds, {}, time.time_ns)
     counts: Counter[str] = Counter()
     kept = ""
     try:
@@ -58,13 +45,10 @@ def record(
             recording = _Recording(Path(staging, output.stem))
             try:
                 recording.writer.open()
-                while not stop.is_set() or not inbox.is_empty:
-                    try:
-                        topic, received_ns, payload = inbox.get(_POLL_S)
-                    except queue.Empty:
-                        continue
-                    recording.write(topic, kinds[topic], received_ns, payload)
-                    counts[topic] += 1
+                while (message := inbox.get(_POLL_S)) is not None or not stop.is_set():
+                    if message is not None:
+                        recording.write(message, kinds[message.topic])
+                        counts[message.topic] += 1
                 recording.writer.close()
             except BaseException as error:
                 if recording.rescue(error):
@@ -89,38 +73,6 @@ def _part_of(output: Path) -> Path:
     parts = (f"part-{number}" if number > 1 else "part" for number in count(1))
     places = (output.with_name(f"{output.stem}.{part}{output.suffix}") for part in parts)
     return next(place for place in places if not place.exists())
-
-
-class _Inbox:
-    """Messages that wait for the disk. Any thread may put."""
-
-    def __init__(self) -> None:
-        self.lost = 0
-        """Messages that came while too many bytes waited."""
-        self._messages: queue.SimpleQueue[tuple[str, int, bytes]] = queue.SimpleQueue()
-        self._waiting_bytes = 0
-        self._lock = threading.Lock()
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no message waits."""
-        return self._messages.empty()
-
-    def put(self, topic: str, received_ns: int, payload: bytes) -> None:
-        """Add the next message, or lose it if too much waits."""
-        with self._lock:
-            if self._waiting_bytes + len(payload) > LARGEST_INBOX_BYTES:
-                self.lost += 1
-                return
-            self._waiting_bytes += len(payload)
-        self._messages.put((topic, received_ns, payload))
-
-    def get(self, timeout_s: float) -> tuple[str, int, bytes]:
-        """The next message."""
-        message = self._messages.get(timeout=timeout_s)
-        with self._lock:
-            self._waiting_bytes -= len(message[2])
-        return message
 
 
 class _Recording:
@@ -151,8 +103,9 @@ class _Recording:
         except OSError:
             return self.file.exists()
 
-    def write(self, topic: str, kind: str, received_ns: int, payload: bytes) -> None:
+    def write(self, message: ReceivedMessage, kind: str) -> None:
         """Write a message; the time of recording only ever grows."""
+        topic, payload, received_ns = message
         if topic not in self._connections:
             self._connections[topic] = self.writer.add_connection(topic, full_name(kind), typestore=self._store)
         self._latest_ns = max(self._latest_ns, received_ns)
