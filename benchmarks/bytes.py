@@ -21,7 +21,7 @@ from typing import Any
 
 import common
 import numpy as np
-from relation_closures import evaluate_closures
+from evaluation.relation_closures import evaluate_closures
 
 from fcslam.cloud.cloud import Cloud
 from fcslam.lab.evaluation.closures import ClosureScope

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import common
 import numpy as np
-from relation_closures import ClosureReport, evaluate_closures
+from evaluation.relation_closures import ClosureReport, evaluate_closures
 
 from fcslam.lab.evaluation.closures import STAGES, ClosureScope
 

@@ -5,6 +5,7 @@ command import nothing heavy before it.
 """
 
 import argparse
+import csv
 import json
 import math
 import os
@@ -29,6 +30,9 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 SPLITS = {"intel": 3, "fr079": 3, "mit-csail": 2}
 """Logs of the SLAM benchmark and into how many robots each is cut."""
+
+TABLE_ROWS, PAGE_ROWS = 12, 40
+"""Most rows of a table on the page of a report, and of all its tables there."""
 
 _COMMAND = "import sys; from fcslam.cli import main; sys.exit(main(sys.argv[1:]))"
 _PACKAGES = ("numpy", "numba", "gtsam", "scipy", "opencv-python-headless", "onnxruntime")
@@ -125,11 +129,11 @@ def options(docstring: str) -> argparse.ArgumentParser:
 
 
 class Report:
-    """Tables, written as Markdown for readers and as JSON for programs."""
+    """Tables: all of them as CSV, one below the other, and a short page in Markdown with the small ones."""
 
     def __init__(self, script: str, docstring: str, chosen: argparse.Namespace) -> None:
         self._name = Path(script).stem
-        self._docstring = docstring.strip()
+        self._summary = " ".join(docstring.strip().split("\n\n")[0].split())
         self._folder: Path = chosen.results
         self._setting = {
             "date": chosen.date,
@@ -137,16 +141,20 @@ class Report:
         }
         self._setting |= machine()
         self._parts: list[str] = []
-        self._tables: dict[str, list[dict[str, Any]]] = {}
+        self._tables: dict[str, list[list[Any]]] = {}
+        self._shown_rows = 0
 
     def say(self, text: str) -> None:
         """A paragraph."""
         self._parts.append(text.strip())
 
     def table(self, title: str, columns: Mapping[str, str], rows: Iterable[Sequence[Any]]) -> None:
-        """A table; ``columns`` maps headings to format specifications, numbers keep all digits in the JSON."""
+        """A table; ``columns`` maps headings to format specifications. One of many rows is in the CSV file alone."""
         kept = [dict(zip(columns, row, strict=True)) for row in rows]
-        self._tables[title] = [{key: _plain(value) for key, value in row.items()} for row in kept]
+        self._tables[title] = [list(columns), *([_exact(value) for value in row.values()] for row in kept)]
+        if len(kept) > min(TABLE_ROWS, PAGE_ROWS - self._shown_rows):
+            return
+        self._shown_rows += len(kept)
         lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
         for row in kept:
             lines.append(f"| {' | '.join(_cell(row[heading], spec) for heading, spec in columns.items())} |")
@@ -159,14 +167,23 @@ class Report:
         self._parts.append(f"![{title}]({self._name}.png)")
 
     def write(self) -> None:
-        """Write both files and print the Markdown."""
+        """Write both files and print the page."""
         setting = "\n".join(f"- {key}: {value}" for key, value in self._setting.items())
-        text = "\n\n".join([f"# {self._name}", self._docstring, setting, *self._parts]) + "\n"
+        links = f"[How it is measured](../{self._name}.py), [all figures]({self._name}.csv)."
+        text = "\n\n".join([f"# {self._name}", f"{self._summary}\n{links}", setting, *self._parts]) + "\n"
         self._folder.mkdir(parents=True, exist_ok=True)
         (self._folder / f"{self._name}.md").write_text(text, encoding="utf-8")
-        content = {"benchmark": self._name, **self._setting, "tables": self._tables}
-        (self._folder / f"{self._name}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        with (self._folder / f"{self._name}.csv").open("w", encoding="utf-8", newline="") as file:
+            for number, (title, rows) in enumerate(self._tables.items()):
+                file.write(f"\n# {title}\n" if number else f"# {title}\n")
+                csv.writer(file, lineterminator="\n").writerows(rows)
         print(text)
+
+
+def figures(path: Path, title: str) -> list[dict[str, str]]:
+    """The rows of a table in the CSV file of a report."""
+    tables = (table.partition("\n") for table in path.read_text(encoding="utf-8").split("\n\n"))
+    return next(list(csv.DictReader(rows.splitlines())) for head, _, rows in tables if head == f"# {title}")
 
 
 class Kept:
@@ -229,9 +246,14 @@ def _version(package: str) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON has it: NaN is null, numpy's numbers are Python's."""
+    """A number of Python; None for NaN."""
     plain = value.item() if hasattr(value, "item") else value
     return None if isinstance(plain, float) and not math.isfinite(plain) else plain
+
+
+def _exact(value: Any) -> Any:
+    plain = _plain(value)
+    return format(plain, ".9g") if isinstance(plain, float) else plain
 
 
 def _cell(value: Any, spec: str) -> str:

@@ -3,10 +3,10 @@
     python benchmarks/detector_training.py --networks FOLDER [--images FOLDER ...] [--minutes 8] [--arms wide ...]
 
 FOLDER keeps the networks; those that it lacks are trained, all at the same time, on photographs of FCSLAM_DATA that no
-table measures, and on --images, such as renders. Pairs are drawn on the device (`device_pairs.py`).
+table measures, and on --images, such as renders. Pairs are drawn on the device (`evaluation/device_pairs.py`).
 
 - near, wide, turns: the light network from the bundled one, with the losses of `fcslam tools train` and the
-  localization loss of `subpixel_loss.py`, in float32. Views change as in `fcslam tools train` in `near`. In the
+  loss of `evaluation/subpixel_loss.py`, in float32. Views change as in `fcslam tools train` in `near`. In the
   others, the scales of a pair differ by up to 4; in `wide` views turn by 26 degrees (standard deviation), in `turns`
   half of them by any angle. Labels are those of the bundled network and of Harris's measure
 - longer, mixed: `near`, trained on. A quarter of the pairs of `mixed` change as in `wide`. The learning rate rises
@@ -38,8 +38,8 @@ from typing import Any
 
 import common
 import torch
-from device_pairs import Change, Photographs, draw_on_device
-from subpixel_loss import localization_loss
+from evaluation.device_pairs import Change, Photographs, draw_on_device
+from evaluation.subpixel_loss import localization_loss
 from torch import Tensor
 
 from fcslam.features.detector import BUNDLED_NETWORK

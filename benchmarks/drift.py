@@ -2,8 +2,8 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/drift.py --work build/drift
 
-One robot drives for three and a half minutes through each of 14 floors (`benchmarks/floor_worlds.py`), with each of
-three scanners. Its scans are tracked one after the other, without loop closures. The error of a stretch of 25, 50 or
+One robot drives for three and a half minutes through each of 14 floors (`worlds/floor_worlds.py`), with each of three
+scanners. Its scans are tracked one after the other, without loop closures. The error of a stretch of 25, 50 or
 100 m of path is the motion over it by the tracker, against the true one: of its heading, and of its position. Stretches
 begin every 2 m. A drive that is shorter gives none.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import common
 import numpy as np
-from floor_worlds import FLOORS, drive
+from worlds.floor_worlds import FLOORS, drive
 
 from fcslam.geometry import se2
 from fcslam.metrics.trajectory import interpolate

@@ -38,8 +38,8 @@ from typing import TYPE_CHECKING, Any
 
 import common
 import numpy as np
+from evaluation.federated.training_fleet import GAPS, SIMULATED, TITLES, VISION, compare, gap_row, points, robots, run
 from matplotlib.figure import Figure
-from training_fleet import GAPS, SIMULATED, TITLES, VISION, compare, gap_row, points, robots, run
 
 from fcslam.learning.federated.coordinator import RoundRules
 from fcslam.learning.federated.screening import ScreeningBounds
@@ -48,7 +48,7 @@ from fcslam.metrics.bootstrap import mean_interval
 
 if TYPE_CHECKING:
     from evaluation.federated.study import StudyResults
-    from training_fleet import Rows
+    from evaluation.federated.training_fleet import Rows
 
 PUBLIC = "sun_hays80"
 """Photographs that the start is trained on."""

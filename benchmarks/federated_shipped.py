@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import common
 from evaluation.detectors import EvaluatedDetectorKind, SceneKind, choose_detectors, find_scenes
+from evaluation.federated.training_fleet import GAPS, TITLES, VISION, compare, gap_row, points, robots, run
 from evaluation.homography import HomographyGroundTruth, difference, evaluate_homography, mean
-from training_fleet import GAPS, TITLES, VISION, compare, gap_row, points, robots, run
 
 from fcslam.features.detector import BUNDLED_NETWORK
 

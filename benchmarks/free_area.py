@@ -2,8 +2,8 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/free_area.py --work build/free
 
-Robots drive for three minutes through published floors (floor_worlds.py), with three scanners: ``rplidar`` 12 m and
-``short`` 8 m all around, ``sick`` 25 m over 270 degrees. Beams get lost on grazed walls, 1 % of all are lost, and
+Robots drive for three minutes through published floors (worlds/floor_worlds.py), with three scanners: ``rplidar`` 12 m
+and ``short`` 8 m all around, ``sick`` 25 m over 270 degrees. Beams get lost on grazed walls, 1 % of all are lost, and
 surfaces that a floor does not know, as black ones or windows, give no return. With an even seed, two robots drive.
 
 - *Not free*: free cells of the map that are not free in the floor, as a share of the free cells. The map is laid on the
@@ -23,11 +23,11 @@ from functools import partial
 from pathlib import Path
 
 import common
-import floor_worlds
 import numpy as np
-from floor_worlds import CELL_M, FLOORS, Floor
 from numpy.typing import NDArray
 from scipy import ndimage
+from worlds import floor_worlds
+from worlds.floor_worlds import CELL_M, FLOORS, Floor
 
 from fcslam.compiled import njit
 from fcslam.geometry import se2

@@ -14,7 +14,7 @@ from typing import Any
 
 import common
 import numpy as np
-from g2o_files import read_g2o
+from evaluation.g2o_files import read_g2o
 
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.optimizer import optimize, optimize_gnc

@@ -23,9 +23,9 @@ from itertools import islice
 from pathlib import Path
 
 import common
-import floor_worlds
 import numpy as np
 from convert_logs import readable
+from worlds import floor_worlds
 
 from fcslam.errors import SourceError
 from fcslam.geometry import se2

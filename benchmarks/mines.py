@@ -15,7 +15,7 @@ import sys
 
 import common
 from convert_logs import readable
-from map_search import PAIR_COLUMNS, Together, map_together, pair_rows
+from evaluation.map_search import PAIR_COLUMNS, Together, map_together, pair_rows
 
 from fcslam.geometry import se2
 

@@ -9,7 +9,6 @@ The least of the repetitions counts; committed figures stand in brackets. Worse 
 0.5 mm, CPU by more than 25 %, or more maps. The script fails then.
 """
 
-import json
 import sys
 import tempfile
 import time
@@ -38,8 +37,8 @@ def main() -> None:
         report.table(TITLE, COLUMNS, rows)
         report.write()
         return
-    kept = json.loads((chosen.results / "quick.json").read_text(encoding="utf-8"))["tables"][TITLE]
-    committed = {(row["log"], row["robots"]): row for row in kept}
+    kept = common.figures(chosen.results / "quick.csv", TITLE)
+    committed = {(row["log"], int(row["robots"])): row for row in kept}
     worse = [line for row in rows for line in compared(dict(zip(COLUMNS, row, strict=True)), committed)]
     if worse:
         sys.exit("worse:\n" + "\n".join(worse))
@@ -73,8 +72,8 @@ def load_s() -> float:
 def compared(row: dict, committed: dict) -> list[str]:
     """Print one comparison; returns what got worse."""
     case = f"{row['log']}, robots: {row['robots']}"
-    before = committed[row["log"], row["robots"]]
     error, cpu = "mean error, m", "CPU, loads"
+    before = {name: float(committed[row["log"], row["robots"]][name]) for name in ("maps", error, cpu)}
     errors = f"error {row[error]:.4f} m ({before[error]:.4f})"
     print(f"{case}: {errors}, CPU {row[cpu]:.2f} loads ({before[cpu]:.2f})")
     return [

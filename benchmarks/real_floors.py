@@ -4,7 +4,7 @@
     FCSLAM_DATA=/path/to/data python benchmarks/real_floors.py --kinds "other floor" year --work build/floors
 
 A simulator that is not part of the project drives robots through occupancy grids of real buildings
-(`benchmarks/floor_worlds.py`). `fcslam map` maps each pair by its default configuration.
+(`benchmarks/worlds/floor_worlds.py`). `fcslam map` maps each pair by its default configuration.
 
 - pair: two robots on one floor, with about 27 or 40 % of the walls in common.
 - year: two robots on one real floor, in two of three years, each for five minutes.
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import common
-from floor_worlds import FLOORS, Floor, drive, joint_errors, maps_of, mirrored, refurnished, shifted
+from worlds.floor_worlds import FLOORS, Floor, drive, joint_errors, maps_of, mirrored, refurnished, shifted
 
 RIGHT_M = 0.5
 SCANNERS = "rplidar", "sick", "short"

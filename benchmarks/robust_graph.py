@@ -36,7 +36,7 @@ from pathlib import Path
 import common
 import gtsam
 import numpy as np
-from g2o_files import read_g2o
+from evaluation.g2o_files import read_g2o
 from numpy.random import Generator
 from numpy.typing import NDArray
 

@@ -27,7 +27,7 @@ import common
 import cv2
 import numpy as np
 from robustness import Recording
-from wall_tags import SIZE_M, WallTag, draw_tags, hang_tags
+from worlds.wall_tags import SIZE_M, WallTag, draw_tags, hang_tags
 
 from fcslam.config import parse
 from fcslam.geometry import se2

@@ -17,7 +17,7 @@ from pathlib import Path
 import common
 import numpy as np
 from convert_logs import readable
-from map_search import PAIR_COLUMNS, FloatArray, Placed, Plan, map_together, mean_at, pair_rows, search
+from evaluation.map_search import PAIR_COLUMNS, FloatArray, Placed, Plan, map_together, mean_at, pair_rows, search
 
 from fcslam.geometry import se2
 from fcslam.runs import Run

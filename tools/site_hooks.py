@@ -6,7 +6,6 @@ A link such as ``../../benchmarks/results/fuzz.md`` works in a clone of the repo
 copied to ``files/`` and the link leads there.
 """
 
-import json
 import posixpath
 import re
 from pathlib import Path
@@ -22,6 +21,7 @@ SCRIPT = re.compile(r"python (benchmarks/\w+\.py)")
 INLINE = re.compile(r"(?<!<pre>)(?<!</span>)<code>[^<]*</code>")
 WORD = re.compile(r"(?<![^\s>])[^\s<>]+")
 LONGEST_WORD = 20
+SETTING = re.compile(r"^- (command|date|versions): (.*)$", re.MULTILINE)
 COMMIT = re.compile(r"\(([0-9a-f]{7,})")
 
 
@@ -52,10 +52,10 @@ def reports(text: str) -> list[str]:
     """A row for each report of the scripts that a page of results names: command, date, commit."""
     scripts = set(SCRIPT.findall(text))
     rows = []
-    for path in sorted((ROOT / "benchmarks" / "results").glob("*.json")):
-        report = json.loads(path.read_text(encoding="utf-8"))
-        found = SCRIPT.search(str(report.get("command", ""))) if isinstance(report, dict) else None
-        if found and found[1] in scripts and path.with_suffix(".md").is_file():
+    for path in sorted((ROOT / "benchmarks" / "results").glob("*.md")):
+        report = dict(SETTING.findall(path.read_text(encoding="utf-8")))
+        found = SCRIPT.search(report.get("command", ""))
+        if found and found[1] in scripts:
             commit = COMMIT.search(report["versions"])
             link = f"[{path.stem}](../../benchmarks/results/{path.stem}.md)"
             rows.append(f"| {link} | `{report['command']}` | {report['date']} | {commit[1] if commit else ''} |")

@@ -2,14 +2,15 @@
 
 import ast
 import importlib.util
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import common
 import numpy as np
 import pytest
+from evaluation import map_search
 from scipy.ndimage import binary_dilation
 
 from fcslam.config import load as load_config
@@ -20,19 +21,7 @@ from fcslam.records import Channel
 from tests.features.networks import tiny_network
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
-SHARED = (
-    "common",
-    "device_pairs",
-    "map_search",
-    "processes",
-    "training_fleet",
-    "wall_tags",
-    "relation_closures",
-    "subpixel_loss",
-    "g2o_files",
-    "floor_worlds",
-    "convert_logs",
-)
+SHARED = ("common", "convert_logs", "processes")
 SCRIPTS = sorted(path for path in FOLDER.glob("*.py") if path.stem not in SHARED)
 
 
@@ -42,15 +31,6 @@ def load(path: Path):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-@pytest.fixture
-def common(monkeypatch):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    monkeypatch.delitem(sys.modules, "common", raising=False)
-    yield load(FOLDER / "common.py")
-    for name in SHARED:  # they hold one another
-        sys.modules.pop(name, None)
 
 
 def test_there_are_benchmarks():
@@ -69,7 +49,6 @@ def test_every_script_has_a_report():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
-@pytest.mark.usefixtures("common")
 def test_imports_without_running(path, capsys):
     try:
         script = load(path)
@@ -81,7 +60,7 @@ def test_imports_without_running(path, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_without_recordings_one_line_and_success(common, monkeypatch, capsys):
+def test_without_recordings_one_line_and_success(monkeypatch, capsys):
     monkeypatch.delenv("FCSLAM_DATA", raising=False)
     with pytest.raises(SystemExit) as ended:
         common.recordings("slam-benchmark/intel.clf.xz")
@@ -89,7 +68,7 @@ def test_without_recordings_one_line_and_success(common, monkeypatch, capsys):
     assert capsys.readouterr().out == "skipped: needs recordings; set FCSLAM_DATA to their folder\n"
 
 
-def test_missing_recordings_fail_with_their_names(common, monkeypatch, tmp_path):
+def test_missing_recordings_fail_with_their_names(monkeypatch, tmp_path):
     monkeypatch.setenv("FCSLAM_DATA", str(tmp_path))
     with pytest.raises(SystemExit, match=r"intel\.clf\.xz missing"):
         common.recordings("slam-benchmark/intel.clf.xz")
@@ -104,7 +83,7 @@ def test_a_script_without_recordings_succeeds(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_report_is_two_files_that_say_the_same(common, tmp_path, monkeypatch, capsys):
+def test_a_report_is_two_files_that_say_the_same(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["sample.py"])
     chosen = common.options("Sample.").parse_args(["--results", str(tmp_path), "--date", "2026-11-05"])
     report = common.Report("benchmarks/sample.py", "Sample.", chosen)
@@ -115,13 +94,11 @@ def test_a_report_is_two_files_that_say_the_same(common, tmp_path, monkeypatch, 
     assert "| b | - |" in markdown
     assert "- date: 2026-11-05" in markdown
     assert markdown in capsys.readouterr().out
-    content = json.loads((tmp_path / "sample.json").read_text(encoding="utf-8"))
-    assert content["tables"] == {"Numbers": [{"what": "a", "m": 1.23456}, {"what": "b", "m": None}]}
-    assert {"date", "machine", "versions", "command"} <= set(content)
+    assert common.figures(tmp_path / "sample.csv", "Numbers") == [{"what": "a", "m": "1.23456"}, {"what": "b", "m": ""}]
 
 
 @pytest.mark.slow
-def test_a_picture_lies_beside_the_report(common, tmp_path, monkeypatch, capsys):
+def test_a_picture_lies_beside_the_report(tmp_path, monkeypatch, capsys):
     from matplotlib.figure import Figure
 
     monkeypatch.setattr(sys, "argv", ["sample.py"])
@@ -136,7 +113,7 @@ def test_a_picture_lies_beside_the_report(common, tmp_path, monkeypatch, capsys)
 
 
 @pytest.mark.slow
-def test_the_command_is_measured_and_its_failure_ends_the_script(common):
+def test_the_command_is_measured_and_its_failure_ends_the_script():
     cost = common.run_fcslam("--version")
     assert cost.cpu_s > 0.0
     assert 0.0 < cost.wall_s < 60.0
@@ -146,9 +123,7 @@ def test_the_command_is_measured_and_its_failure_ends_the_script(common):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("common")
 def test_the_search_finds_where_a_piece_was_cut_out():
-    map_search = load(FOLDER / "map_search.py")
     rng = np.random.default_rng(5)
     free = np.zeros((160, 200), bool)
     for row, column in zip(rng.integers(20, 110, 8), rng.integers(20, 140, 8), strict=True):
@@ -168,7 +143,7 @@ def test_the_search_finds_where_a_piece_was_cut_out():
 
 
 @pytest.fixture
-def camera_detectors(common):
+def camera_detectors():
     return load(FOLDER / "camera_detectors.py")
 
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from evaluation.g2o_files import read_g2o
 
-from benchmarks.g2o_files import read_g2o
 from fcslam.cloud.report import LEAST_DRAWN, keyscan_track, run_of
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.records import ClosureStatus

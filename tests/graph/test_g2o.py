@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evaluation.g2o_files import read_g2o
 
-from benchmarks.g2o_files import read_g2o
 from fcslam.errors import InputError
 from fcslam.graph.g2o import g2o_text
 from tests.graph.graph_worlds import manhattan

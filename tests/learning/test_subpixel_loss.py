@@ -5,7 +5,8 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
-from benchmarks.subpixel_loss import HUBER_PX, MOST_PEAKS, localization_loss, peaks  # noqa: E402
+from evaluation.subpixel_loss import HUBER_PX, MOST_PEAKS, localization_loss, peaks  # noqa: E402
+
 from fcslam.features.dense import find_peaks  # noqa: E402
 from fcslam.features.detector import OnnxConfig  # noqa: E402
 

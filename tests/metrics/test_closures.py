@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from evaluation.relation_closures import BRIDGE_S, PoseReference, RelationReference, closure_errors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.relation_closures import BRIDGE_S, PoseReference, RelationReference, closure_errors
 from fcslam.geometry import se2
 from fcslam.metrics.closures import (
     path_lengths,

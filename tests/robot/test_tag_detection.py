@@ -5,8 +5,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from worlds.wall_tags import WallTag, draw_tags
 
-from benchmarks.wall_tags import WallTag, draw_tags
 from fcslam.config import parse
 from fcslam.errors import ConfigError
 from fcslam.geometry import se2

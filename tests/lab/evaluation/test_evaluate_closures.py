@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evaluation.relation_closures import build_relation_graph, evaluate_closures
 
-from benchmarks.relation_closures import build_relation_graph, evaluate_closures
 from fcslam.cli import main
 from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
@@ -115,7 +115,7 @@ def test_recall_needs_a_correct_closure_of_the_stage(tmp_path, relations, monkey
     assert [r.found for r in found] == [0, 0, 0]
     # within a robot 60 s are asked for, and 50 steps last 20 s
     assert report.scores[ClosureScope.ROBOT, ACCEPTED].recall.revisits == 0
-    monkeypatch.setattr("benchmarks.relation_closures.WITHIN_GAP_S", 15.0)
+    monkeypatch.setattr("evaluation.relation_closures.WITHIN_GAP_S", 15.0)
     longer = evaluate_closures(write(tmp_path / "run", [closure((1, 6), (1, 56), ACCEPTED)]), relations)
     assert longer.scores[ClosureScope.ROBOT, ACCEPTED].recall.revisits == 2
     assert longer.scores[ClosureScope.ROBOT, ACCEPTED].recall.found == 1
