@@ -30,7 +30,7 @@ HAS_LEARNING := $(BIN)/python -c "import flwr, onnx, torch" 2>/dev/null
 # nothing and slows the others. `nproc` obeys OMP_NUM_THREADS.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n $(shell expr $$(env -u OMP_NUM_THREADS nproc) + 1) --maxprocesses 8 --dist worksteal
-BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/processes.py benchmarks/quick.py,$(wildcard benchmarks/*.py))
+BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/convert_logs.py benchmarks/processes.py benchmarks/quick.py,$(wildcard benchmarks/*.py))
 
 .PHONY: help install gl learning demo test test-fast test-system test-all test-training test-attack ros-test browser-test scale-test check bench bench-quick docs proto fuzz lock sbom audit
 .DEFAULT_GOAL := help

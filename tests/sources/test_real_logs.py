@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from convert_logs import readable
 
-from benchmarks.convert_logs import readable
 from fcslam.sources import Fault, open_source, split
 from tests.sources.carmen_text import scans_of
 
