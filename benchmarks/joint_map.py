@@ -179,7 +179,7 @@ def _ages(samples, paths, scans, number, joined_s):
         by_stamp = {scan.stamp: scan for scan in own}
         for stamp, pose in zip(path.stamps.tolist(), path.T_map_base, strict=True):
             scan = by_stamp[min(by_stamp, key=lambda each, stamp=stamp: abs(each - stamp))]
-            grid = cast([Casting(scan.ranges_m, scan.laser, pose)], OccupancyConfig(minimum_passes=1))
+            grid = cast([Casting(scan.ranges_m, scan.laser, pose)], OccupancyConfig())
             column, row = np.round(np.array(grid.origin_xy) / grid.resolution_m).astype(int)
             for y, x in zip(*np.nonzero(grid.passes), strict=True):
                 seen.setdefault((row + int(y), column + int(x)), stamp)

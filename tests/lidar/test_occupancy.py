@@ -139,7 +139,7 @@ def test_counts_of_all_keyscans_are_the_sum_of_each():
 
 def test_a_square_room_is_closed_and_free_inside():
     grid = cast(room_scans(), CONFIG)
-    cells = classify(grid, CONFIG)
+    cells = classify(grid)
     rooms, _ = ndimage.label(cells != Occupancy.OCCUPIED)
     y, x = (grid.origin_xy[k] + (np.arange(cells.shape[1 - k]) + 0.5) * CELL_M for k in (1, 0))
     inside = (np.abs(x)[None, :] < HALF_ROOM_M - 0.1) & (np.abs(y)[:, None] < HALF_ROOM_M - 0.1)
@@ -199,7 +199,7 @@ def short_scan(x, y, seen_from_m=4.0, lost=0.0, seed=0, person=False):
 def states(castings, config=CONFIG):
     """The state of the cell at any (x, y)."""
     grid = cast(castings, config)
-    cells = classify(grid, config)
+    cells = classify(grid)
 
     def at(x, y):
         column, row = (int(np.floor((v - o) / CELL_M)) for v, o in zip((x, y), grid.origin_xy, strict=True))
@@ -213,7 +213,7 @@ def states(castings, config=CONFIG):
 def test_a_hall_is_free_as_far_as_its_scan_has_a_return(longest_m):
     """Half of the turn has no return: the opposite wall of the hall is beyond the maximum range."""
     scans = [short_scan(0.0, 0.0), short_scan(0.01, 0.0)]
-    at = states(scans, OccupancyConfig(resolution_m=CELL_M, no_return_range_m=longest_m))
+    at = states(scans, OccupancyConfig(resolution_m=CELL_M, usable_range_m=longest_m))
     farthest = max(r for r in scans[0].ranges_m.tolist() if r < SHORT.max_range_m)
     assert farthest > 0.97 * SHORT.max_range_m
     reach = min(longest_m, farthest)
@@ -222,12 +222,8 @@ def test_a_hall_is_free_as_far_as_its_scan_has_a_return(longest_m):
             assert at(share * reach * np.cos(heading), share * reach * np.sin(heading)) == expected
 
 
-def test_beams_without_return_clear_nothing_if_no_other_beam_has_one_or_the_limit_is_0():
+def test_beams_without_return_clear_nothing_if_no_other_beam_has_one():
     assert cast([short_scan(0.0, -4.0)], CONFIG).passes.sum() == 0
-    wall = short_scan(0.0, 0.0)
-    alone = wall._replace(ranges_m=np.where(np.isinf(wall.ranges_m), 0.0, wall.ranges_m).astype(np.float32))
-    none = cast([wall], CONFIG.model_copy(update={"no_return_range_m": 0.0}))
-    assert none.passes.sum() == cast([alone], CONFIG).passes.sum()
 
 
 @settings(max_examples=100)
@@ -277,7 +273,7 @@ def test_a_person_who_left_is_cleared_by_beams_without_return(later):
     assert states(there)(0.0, -0.15) == Occupancy.OCCUPIED
     periods = [there, gone] if later else [there + gone]
     *_, grid = cast_periods(periods, CONFIG)
-    cells = classify(grid, CONFIG)
+    cells = classify(grid)
     column, row = (int(np.floor((v - o) / CELL_M)) for v, o in zip((0.0, 0.0), grid.origin_xy, strict=True))
     assert (cells[row - 3 : row + 4, column - 3 : column + 4] == Occupancy.FREE).all()
 
@@ -289,7 +285,7 @@ def test_a_wall_stays_whose_returns_are_missing_at_times(seen_from_m, lost):
     far = [short_scan(-2.0 + 0.04 * k, 0.5, seen_from_m, lost, k) for k in range(100)]
     for periods in ([near + far], [near, far]):
         *_, grid = cast_periods(periods, CONFIG)
-        cells = classify(grid, CONFIG)
+        cells = classify(grid)
         row, left, right = (
             int(np.floor(v / CELL_M)) for v in (3.0 - grid.origin_xy[1], -2 - grid.origin_xy[0], 2 - grid.origin_xy[0])
         )
@@ -306,7 +302,7 @@ def test_a_black_panel_in_a_wall_stays_although_later_scans_see_only_the_wall_be
         far.append(scan._replace(ranges_m=np.where(np.abs(x) < 0.5, np.inf, scan.ranges_m).astype(np.float32)))
     for periods in ([near + far], [near, far]):
         *_, grid = cast_periods(periods, CONFIG)
-        cells = classify(grid, CONFIG)
+        cells = classify(grid)
         (left, row), (right, _) = (
             np.floor(np.subtract((x, 3.0), grid.origin_xy) / CELL_M).astype(int) for x in (-1.5, 1.5)
         )
@@ -338,7 +334,7 @@ def test_a_grid_too_large_gets_coarser_instead():
 def test_no_keyscans_make_one_unknown_cell():
     grid = cast([], CONFIG)
     assert grid.passes.tolist() == [[0]]
-    assert classify(grid, CONFIG).tolist() == [[Occupancy.UNKNOWN]]
+    assert classify(grid).tolist() == [[Occupancy.UNKNOWN]]
 
 
 @pytest.mark.parametrize("pose", [(np.nan, 0, 0), (0, np.inf, 0), (0, 0, np.nan), (0, 0, np.inf), (1e12, 0, 0)])
@@ -355,20 +351,20 @@ def test_what_does_not_fit_is_refused():
 
 
 def test_a_cell_is_known_after_two_passes_and_occupied_by_the_share_of_hits():
-    lengths = [0.5] * 8 + [0.3]  # the last ends in a cell that the others pass
-    scans = [Casting(np.array([r], np.float32), ONE_BEAM, np.array((0.01, 0.01, 0.0))) for r in lengths]
-    grid = cast(scans, CONFIG)
-    row, first = (round(-grid.origin_xy[k] / CELL_M) for k in (1, 0))
-    near, far = first + int(0.31 / CELL_M), first + int(0.51 / CELL_M)
-    assert (grid.hits[row, near], grid.passes[row, near]) == (1, 9)
-    assert (grid.hits[row, far], grid.passes[row, far]) == (8, 8)
-    for ratio, expected in ((0.11, Occupancy.OCCUPIED), (0.12, Occupancy.FREE)):
-        cells = classify(grid, CONFIG.model_copy(update={"occupied_ratio": ratio}))
+    for others, expected in ((5, Occupancy.OCCUPIED), (6, Occupancy.FREE)):
+        lengths = [0.5] * others + [0.3]  # the last ends in a cell that the others pass
+        scans = [Casting(np.array([r], np.float32), ONE_BEAM, np.array((0.01, 0.01, 0.0))) for r in lengths]
+        grid = cast(scans, CONFIG)
+        row, first = (round(-grid.origin_xy[k] / CELL_M) for k in (1, 0))
+        near, far = first + int(0.31 / CELL_M), first + int(0.51 / CELL_M)
+        assert (grid.hits[row, near], grid.passes[row, near]) == (1, others + 1)
+        assert (grid.hits[row, far], grid.passes[row, far]) == (others, others)
+        cells = classify(grid)
         assert cells[row, near] == expected
         assert cells[row, far] == Occupancy.OCCUPIED
         assert cells[row, near + 1] == Occupancy.FREE
-    assert (classify(cast(scans[:1], CONFIG), CONFIG) == Occupancy.UNKNOWN).all()
-    assert (classify(cast(scans[:2], CONFIG), CONFIG) != Occupancy.UNKNOWN).sum() == far - first + 1
+    assert (classify(cast(scans[:1], CONFIG)) == Occupancy.UNKNOWN).all()
+    assert (classify(cast(scans[:2], CONFIG)) != Occupancy.UNKNOWN).sum() == far - first + 1
 
 
 def room_cells(*halves, scans=12, config=CONFIG):
@@ -378,7 +374,7 @@ def room_cells(*halves, scans=12, config=CONFIG):
         for half in halves
     ]
     *_, grid = cast_periods(periods, config)
-    return grid, classify(grid, config)
+    return grid, classify(grid)
 
 
 POSES_INSIDE = np.random.default_rng(4).uniform((-0.7, -0.7, -3.0), (0.7, 0.7, 3.0), (12, 3))
@@ -424,4 +420,4 @@ def test_periods_that_agree_are_added_up():
     assert grid.origin_xy == at_once.origin_xy
     assert grid.hits.sum() == at_once.hits.sum()
     walls = at_once.hits > 0
-    assert np.array_equal(classify(grid, CONFIG)[walls], classify(at_once, CONFIG)[walls])
+    assert np.array_equal(classify(grid)[walls], classify(at_once)[walls])

@@ -52,7 +52,7 @@ def joint():
     poses = worlds.drive([(-3.0, -1.0), (1.5, -2.0), (3.2, 1.0), (-0.5, 2.0)], step_m=0.3)
     config = OccupancyConfig()
     grid = cast([Casting(scan_at(pose, worlds.room())[0].ranges_m, LASER, pose) for pose in poses], config)
-    return OccupancyMap(classify(grid, config), grid.resolution_m, grid.origin_xy)
+    return OccupancyMap(classify(grid), grid.resolution_m, grid.origin_xy)
 
 
 def on(scan, joint, *teammates, pose=HERE):

@@ -23,8 +23,12 @@ from fcslam.records import FloatArray, LaserModel, Ranges, Sweep
 
 Counts = NDArray[np.uint32]
 
+MINIMUM_PASSES = 2
+"""Least number of beams through a known cell."""
+OCCUPIED_RATIO = 0.15
+"""Ratio of hits to passes above which a cell is occupied."""
 CLEAR_RATIO = 0.05
-"""Ratio of hits to passes up to which a period calls a cell free that was occupied. It is far below ``occupied_ratio``:
+"""Ratio of hits to passes up to which a period calls a cell free that was occupied. It is far below ``OCCUPIED_RATIO``:
 beams that graze a wall hit its cells seldom, too."""
 CLEARANCE_CELLS = 2.0
 """A beam without return ends this far before the line between the returns beside it, which may be one surface."""
@@ -39,18 +43,10 @@ class OccupancyConfig(Settings):
 
     resolution_m: float = Field(default=0.05, ge=0.001, le=10.0, description="side of a cell [m]")
     usable_range_m: float = Field(
-        default=30.0, gt=0, le=1000.0, description="longer beams clear cells up to this range and hit nothing [m]"
-    )
-    no_return_range_m: float = Field(
         default=30.0,
-        ge=0,
+        gt=0,
         le=1000.0,
-        description="beams that report no return (inf) clear cells up to the returns beside them, at most up to this "
-        "range [m]; 0: they clear none",
-    )
-    minimum_passes: int = Field(default=2, ge=1, description="least number of beams through a known cell")
-    occupied_ratio: float = Field(
-        default=0.15, gt=0, lt=1, description="ratio of hits to passes above which a cell is occupied"
+        description="longer beams, and those without return, clear cells up to this range at most and hit nothing [m]",
     )
     contradicting_scans: int = Field(
         default=3,
@@ -184,15 +180,7 @@ def cast_periods(periods: Sequence[Sequence[Casting]], config: OccupancyConfig) 
         else:
             counts = _counts(layout, by_scan=True)
             _cast_all(period, layout, config, counts)
-            _supersede(
-                hits,
-                passes,
-                counts,
-                config.contradicting_scans,
-                CLEAR_RATIO,
-                config.occupied_ratio,
-                config.minimum_passes,
-            )
+            _supersede(hits, passes, counts, config.contradicting_scans)
         shown = hits.view(), passes.view()
         for view in shown:
             view.setflags(write=False)
@@ -231,10 +219,8 @@ def draw_over(base: OccupancyMap, scans: Sequence[Casting], config: OccupancyCon
     passes[inside] = np.where(base.cells != Occupancy.UNKNOWN, SETTLED_PASSES, 0)
     hits[inside] = np.where(base.cells == Occupancy.OCCUPIED, SETTLED_PASSES, 0)
     _cast_all(groups, layout, config, counts)
-    _supersede(
-        hits, passes, counts, config.contradicting_scans, CLEAR_RATIO, config.occupied_ratio, config.minimum_passes
-    )
-    cells = _classify(hits, passes, config.minimum_passes, config.occupied_ratio)
+    _supersede(hits, passes, counts, config.contradicting_scans)
+    cells = _classify(hits, passes)
     return OccupancyMap(cells, side, (left * side + off_x, bottom * side + off_y), base.floor)
 
 
@@ -243,7 +229,7 @@ def _by_laser(keyscans: Sequence[Casting], config: OccupancyConfig) -> list[_Bea
     for scan in keyscans:
         times = _AT_ONCE if scan.sweep is None else Sweep(scan.sweep.first_s, scan.sweep.last_s)
         by_beams.setdefault((scan.laser, times), []).append(scan)
-    return [_stacked(scans, laser, times, config.no_return_range_m) for (laser, times), scans in by_beams.items()]
+    return [_stacked(scans, laser, times, config.usable_range_m) for (laser, times), scans in by_beams.items()]
 
 
 def _cast_all(groups: list[_Beams], layout: _Layout, config: OccupancyConfig, counts: _Counts) -> None:
@@ -258,14 +244,14 @@ def _cast_all(groups: list[_Beams], layout: _Layout, config: OccupancyConfig, co
     occupied = np.zeros(counts.hits.shape, np.bool_)
     for beams, first in numbered:
         _clear(beams, layout, trial, first, occupied)
-    occupied = counts.hits > config.occupied_ratio * trial.passes
+    occupied = counts.hits > OCCUPIED_RATIO * trial.passes
     for beams, first in numbered:
         _clear(beams, layout, counts, first, occupied)
 
 
-def classify(grid: OccupancyGrid, config: OccupancyConfig) -> Cells:
+def classify(grid: OccupancyGrid) -> Cells:
     """``Occupancy`` of every cell, shape (H, W), by Karto's rule: enough passes make it known, enough hits occupied."""
-    cells: Cells = _classify(grid.hits, grid.passes, config.minimum_passes, config.occupied_ratio)
+    cells: Cells = _classify(grid.hits, grid.passes)
     cells.setflags(write=False)
     return cells
 
@@ -433,17 +419,17 @@ def _traverse(x0, y0, x1, y1, counts, scan, occupied):  # type: ignore[no-untype
 
 
 @njit(allocates=False)
-def _supersede(hits, passes, period, scans, clear_ratio, occupied_ratio, minimum_passes):  # type: ignore[no-untyped-def]
+def _supersede(hits, passes, period, scans):  # type: ignore[no-untyped-def]
     """Add the counts of a newer period; where it clearly contradicts, they replace the older ones."""
     for row in range(hits.shape[0]):
         for column in range(hits.shape[1]):
             n, h = period.passes[row, column], period.hits[row, column]
             if n == 0:
                 continue
-            if passes[row, column] >= minimum_passes and period.scans[row, column] >= scans:
-                was_occupied = hits[row, column] > occupied_ratio * passes[row, column]
-                cleared = was_occupied and h <= clear_ratio * n
-                filled = not was_occupied and h >= scans and h > occupied_ratio * n
+            if passes[row, column] >= MINIMUM_PASSES and period.scans[row, column] >= scans:
+                was_occupied = hits[row, column] > OCCUPIED_RATIO * passes[row, column]
+                cleared = was_occupied and h <= CLEAR_RATIO * n
+                filled = not was_occupied and h >= scans and h > OCCUPIED_RATIO * n
                 if cleared or filled:
                     hits[row, column] = passes[row, column] = 0
             hits[row, column] += h
@@ -451,12 +437,12 @@ def _supersede(hits, passes, period, scans, clear_ratio, occupied_ratio, minimum
 
 
 @njit
-def _classify(hits, passes, minimum_passes, occupied_ratio):  # type: ignore[no-untyped-def]
+def _classify(hits, passes):  # type: ignore[no-untyped-def]
     cells = np.zeros(hits.shape, np.uint8)
     for row in range(hits.shape[0]):
         for column in range(hits.shape[1]):
             n = passes[row, column]
-            if n >= minimum_passes:
-                occupied = hits[row, column] > occupied_ratio * n
+            if n >= MINIMUM_PASSES:
+                occupied = hits[row, column] > OCCUPIED_RATIO * n
                 cells[row, column] = 2 if occupied else 1
     return cells

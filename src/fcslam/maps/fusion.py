@@ -83,7 +83,7 @@ def fuse_periods(
     for keyscan, casting in zip(keyscans, scans, strict=True):
         castings[number[keyscan.id.robot]].append(casting)
     for grid in cast_periods(castings, config):
-        yield OccupancyMap(classify(grid, config), grid.resolution_m, grid.origin_xy)
+        yield OccupancyMap(classify(grid), grid.resolution_m, grid.origin_xy)
 
 
 def _without_teammates(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.compiled import njit
-from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast
+from fcslam.lidar.occupancy import MINIMUM_PASSES, OCCUPIED_RATIO, Casting, OccupancyConfig, cast
 from fcslam.lidar.scan import rays_of
 from fcslam.records import FloatArray, frozen
 
@@ -73,7 +73,7 @@ def without_teammates(
             columns, rows = cells[inside].T
             hits[inside] += grid.hits[rows, columns]
             passes[inside] += grid.passes[rows, columns]
-        _drop(kept, suspects, (passes >= config.minimum_passes) & (hits <= config.occupied_ratio * passes))
+        _drop(kept, suspects, (passes >= MINIMUM_PASSES) & (hits <= OCCUPIED_RATIO * passes))
     return kept
 
 
