@@ -322,7 +322,7 @@ def test_a_map_is_read_as_map_server_reads_it(tmp_path):
 def test_a_certificate_is_told_by_map(tmp_path, capsys):
     stretch = {"robot": "a", "length": 4.0, "from": [0, 0], "to": [4, 0]}
     one = {
-        "bar": 0.05, "within": 10.0, "cells": [{"bound_95": bound} for bound in (0.01, 0.04, 0.3)],
+        "verdict": "2 of 3 m2 are good to 0.05 m within 10 m",
         "open_stretches": [stretch], "drives": [{"text": "drive there again"}],
     }  # fmt: skip
     trajectories = {"a": RobotTrajectory("a", 0, frozen(stamps(0)), frozen(truth(0)))}
