@@ -23,15 +23,13 @@ from fcslam.config import one_line, parse_yaml
 from fcslam.errors import EvaluationError, SourceError
 from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap, number_in, read_description
 from fcslam.records import frozen
-from fcslam.untrusted import check_image, read_bytes
+from fcslam.untrusted import MOST_TEXT_BYTES, check_image, read_bytes, read_text
 
 _MODES: Final = ("trinary", "scale", "raw")
 _PGM: Final = re.compile(rb"P([25])(?:\s+|#[^\n]*\n)+\d+(?:\s+|#[^\n]*\n)+\d+(?:\s+|#[^\n]*\n)+([1-9]\d{0,4})\s")
 _MOST_PIXELS: Final = 1 << 28
 """Largest number of cells of a map that is turned: cells of 2.5 cm over 400 m."""
 _PERCENT: Final = 100
-LARGEST_FILE: Final = 1 << 30
-"""Larger map files are refused, bytes."""
 _ROUNDING: Final = 1e-6
 """Share of a cell by which a map that is turned by a right angle may seem wider."""
 
@@ -61,11 +59,11 @@ def read_ros_map(path: Path) -> OccupancyMap:
         SourceError: the files cannot be read as a map.
     """
     try:
-        text = read_bytes(path, most=LARGEST_FILE).decode("utf-8")
+        text = read_text(path, most=MOST_TEXT_BYTES)
         image = parse_yaml(text)["image"]
         if not isinstance(image, str):
             raise TypeError(image)
-        return parse_ros_map(str(path), read_bytes(_image_of(path, image), most=LARGEST_FILE), text)
+        return parse_ros_map(str(path), read_bytes(_image_of(path, image)), text)
     except OSError as error:
         raise SourceError(
             f"{one_line(str(error.filename))}: cannot be read as a map ({error.strerror}); give a run folder or "
