@@ -9,7 +9,8 @@ from fcslam.errors import NetworkError
 from fcslam.records import CameraImage, GnssFix
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.ros import sensors
-from fcslam.ros.sensors import ODOMETRY_PATIENCE_S, PATIENCE_S, SCANS_FOR_RIG, STEPS_BACK_FOR_RESTART, LiveSensors
+from fcslam.ros.live_plan import PATIENCE_S, SCANS_FOR_RIG
+from fcslam.ros.sensors import ODOMETRY_PATIENCE_S, STEPS_BACK_FOR_RESTART, LiveSensors
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import CAMERA_INFO, FIX, IMAGE, MULTI_ECHO_SCAN, POINT_CLOUD
@@ -83,7 +84,7 @@ def test_no_scan_is_lost_while_the_mounting_is_not_known():
     assert robot.stamps == list(np.arange(1.0, 9.0))
     assert robot.records[0].laser.T_base_laser == pytest.approx(LASER_POSE)
     assert robot.records[3].T_odom_base == pytest.approx([4.0, 0.0, 0.0])
-    assert (robot.sensors.odom_frame, robot.sensors.base_frame) == ("odom", "base_link")
+    assert (robot.sensors.planner.odom_frame, robot.sensors.planner.base_frame) == ("odom", "base_link")
 
 
 def test_a_scan_waits_for_its_odometry(robot):
@@ -126,7 +127,7 @@ def test_a_robot_without_odometry_is_mapped_after_some_seconds():
     robot.hears("/scan", scan(2.0, RANGES))
     assert robot.stamps == [1.0, 2.0]
     assert all(np.isnan(record.T_odom_base).all() for record in robot.records)
-    assert robot.sensors.base_frame == "base_link"
+    assert robot.sensors.planner.base_frame == "base_link"
 
 
 def test_odometry_may_be_left_out():
@@ -157,7 +158,7 @@ def test_odometry_from_tf():
         robot.hears("/tf", transform(stamp, "robot/odom", "robot/base", (stamp, 0.0, 0.0)))
         robot.hears("/scan", scan(stamp, RANGES))
     assert robot.records[-1].T_odom_base == pytest.approx([7.0, 0.0, 0.0])
-    assert robot.sensors.odom_frame == "robot/odom"
+    assert robot.sensors.planner.odom_frame == "robot/odom"
 
 
 def test_the_odometry_in_tf_is_that_of_the_laser():
@@ -168,7 +169,7 @@ def test_the_odometry_in_tf_is_that_of_the_laser():
         robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
         robot.hears("/scan", scan(stamp, RANGES))
     assert [record.T_odom_base[0] for record in robot.records] == list(np.arange(1.0, 9.0))
-    assert (robot.sensors.odom_frame, robot.sensors.base_frame) == ("odom", "base_link")
+    assert (robot.sensors.planner.odom_frame, robot.sensors.planner.base_frame) == ("odom", "base_link")
 
 
 def test_the_odometry_in_tf_may_be_named():
@@ -254,7 +255,7 @@ def test_odometry_without_a_frame_is_odometry(robot):
     for stamp in np.arange(1.0, 9.0):
         robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0), frame="")).hears("/scan", scan(stamp, RANGES))
     assert robot.stamps == list(np.arange(1.0, 9.0))
-    assert robot.sensors.odom_frame == "odom"
+    assert robot.sensors.planner.odom_frame == "odom"
 
 
 def test_silence_of_the_odometry_is_told():

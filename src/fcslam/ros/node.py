@@ -21,10 +21,11 @@ from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
 from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock
 from fcslam.ros.inbox import Inbox
+from fcslam.ros.live_plan import Notify
 from fcslam.ros.network import Answer, Endpoint, Quality, RosNetwork, qos_conflict
 from fcslam.ros.outputs import MAP, OWN_MAP, POSE, Outputs, nanoseconds
 from fcslam.ros.parameters import NodeParameters
-from fcslam.ros.sensors import LiveSensors, Notify
+from fcslam.ros.sensors import LiveSensors
 from fcslam.ros.topics import SensorTopics, choose_sensor_topics, resolved
 from fcslam.ros.transform_stream import TransformStream
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, LASER_SCANS, SCANS, MessageCodec
@@ -255,7 +256,7 @@ class RobotNode:
         if np.isnan(pose.T_map_base[0]):
             self._transforms.pause()
             return
-        moved = pose.T_map_base if self.sensors.is_without_odometry else pose.T_map_odom
+        moved = pose.T_map_base if self.sensors.planner.is_without_odometry else pose.T_map_odom
         if moved is not None:
             self._transforms.add(stamp_ns, self._clock.now_ns(), moved)
         self._outputs.pose(stamp_ns, pose.T_map_base, pose.covariance)
@@ -266,7 +267,11 @@ class RobotNode:
         while not self._stop.wait(max(0.0, due_s - time.monotonic())):
             transform = self._transforms.due(self._clock.now_ns())
             if transform is not None:
-                child = self.sensors.base_frame if self.sensors.is_without_odometry else self.sensors.odom_frame
+                child = (
+                    self.sensors.planner.base_frame
+                    if self.sensors.planner.is_without_odometry
+                    else self.sensors.planner.odom_frame
+                )
                 self._outputs.transform(transform.stamp_ns, child, transform.T_map_odom)
             due_s = max(due_s + period_s, time.monotonic() - period_s)
 

@@ -12,8 +12,8 @@ from typing import Any
 from fcslam.errors import OutputError
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC
 from fcslam.ros.inbox import Inbox, ReceivedMessage
+from fcslam.ros.live_plan import Notify
 from fcslam.ros.network import RosNetwork
-from fcslam.ros.sensors import Notify
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.codec import full_name, typestore
 from fcslam.sources.bags.mcap_records import end_mcap

@@ -1,6 +1,7 @@
 """The mounted sensors of a robot: they turn its messages into records."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import degrees, hypot, radians
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ from fcslam.errors import FcslamError
 from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, frozen
 from fcslam.sources.bags.camera import Calibration
 from fcslam.sources.bags.codec import LASER_SCANS
-from fcslam.sources.bags.messages import ScanMessage, measured_ranges, reversed_sweep
+from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, ScanMessage, measured_ranges, reversed_sweep
 from fcslam.sources.bags.options import GivenPose
 from fcslam.sources.bags.pairing import PosedImage, PosedScan
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
@@ -64,6 +65,15 @@ class Rig(NamedTuple):
         laser = self.lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
         sweep = reversed_sweep(scan.sweep) if upside_down else scan.sweep
         return LaserScan(scan.stamp, ranges_m, laser, frozen(posed.T_odom_base), sweep)
+
+    def widened(self, scan: ScanMessage) -> "Rig":
+        """The rig in which a laser whose range_max grows has none of its own: that of each message counts."""
+        laser = self.lasers[scan.laser]
+        if scan.range_max_m <= laser.max_range_m:
+            return self
+        lasers = list(self.lasers)
+        lasers[scan.laser] = replace(laser, max_range_m=UNKNOWN_RANGE_M)
+        return self._replace(lasers=tuple(lasers))
 
     def image(self, posed: PosedImage) -> CameraImage:
         """The record of an image; raises ValueError if it is damaged, or of another camera, or there is none."""
