@@ -14,7 +14,7 @@ import yaml
 from rich.console import Console
 
 from fcslam.cli import live, main
-from fcslam.cli.play import _watch
+from fcslam.cli.play import robot_watch
 from fcslam.cli.progress import ProgressDisplay
 from fcslam.errors import CloudError, StateError
 from fcslam.live.records import RobotStatus, Wiring
@@ -157,7 +157,7 @@ def test_a_robot_that_is_stopped_twice_says_what_is_left_and_goes_on_later(
             return lambda now: now.waiting.packets and os.kill(os.getpid(), number)
 
         with monkeypatch.context() as patched:
-            patched.setattr("fcslam.cli.play._watch", interrupting)
+            patched.setattr("fcslam.cli.play.robot_watch", interrupting)
             assert main([*play, *options]) == 130
         err = capsys.readouterr().err
         assert re.search(r"\d+ packets \(\d+ kB\) wait in .*; to continue, give --resume", err.replace("\n", " "))
@@ -168,7 +168,7 @@ def test_a_robot_that_is_stopped_twice_says_what_is_left_and_goes_on_later(
 def test_a_robot_whose_place_is_in_doubt_again_does_not_say_that_a_session_begins():
     console = Console(file=io.StringIO(), width=200)
     with ProgressDisplay(console) as display:
-        watch = _watch(display, console, 100)
+        watch = robot_watch(display, console, 100)
         for times_lost, quality in [(0, 0.0), (1, 0.0), (1, 0.5), (1, 0.0), (2, 0.0)]:
             watch(
                 RobotStatus(
@@ -182,7 +182,7 @@ def test_a_robot_whose_place_is_in_doubt_again_does_not_say_that_a_session_begin
 def test_a_robot_that_waits_for_a_dead_server_says_so_and_shows_what_waits():
     console = Console(file=io.StringIO(), width=200)
     with ProgressDisplay(console, interval_s=0.01) as display:
-        watch = _watch(display, console, total=10)
+        watch = robot_watch(display, console, total=10)
         trouble = "http://cloud:8340: Connection refused"
         now = RobotStatus(scans=10, keyscans=3, waiting=WaitingPackets(7, 900), trouble=trouble)
         for _ in range(3):
@@ -196,7 +196,7 @@ def test_a_robot_that_waits_for_a_dead_server_says_so_and_shows_what_waits():
 def test_a_robot_that_has_sent_everything_shows_no_old_count():
     console = Console(file=io.StringIO(), width=200)
     with ProgressDisplay(console, interval_s=0.05) as display:
-        watch = _watch(display, console, total=10)
+        watch = robot_watch(display, console, total=10)
         for waiting, confirmed in ((7, 0), (0, 7)):
             watch(
                 RobotStatus(
@@ -231,8 +231,8 @@ def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives(monkeypat
 
     monkeypatch.setattr("fcslam.learning.federated.learning_process.LearningProcess", Process)
     robot = SimpleNamespace(name="anna", idle=lambda: told.append("keyframes are placed"))
-    with live._learning("plan", robot, told.append) as follow:
-        watch = live._watch(told.append, follow)
+    with live.standstill_learning("plan", robot, told.append) as follow:
+        watch = live.pose_watch(told.append, follow)
         for scan in range(1, 30):
             x = 0.0 if scan < 20 else 1.0
             watch(scan, SimpleNamespace(stamp=float(scan), T_odom_base=np.array((x, 0.0, 0.0)), T_map_base=np.zeros(3)))
@@ -285,7 +285,7 @@ def test_a_robot_that_is_turned_away_stops_learning_and_maps_on(monkeypatch):
 
     monkeypatch.setattr("fcslam.learning.federated.learning_process.LearningProcess", Process)
     robot = SimpleNamespace(name="anna", idle=idle)
-    with live._learning("plan", robot, told.append) as follow:
+    with live.standstill_learning("plan", robot, told.append) as follow:
         for scan in range(1, 30):
             follow(SimpleNamespace(stamp=float(scan), T_odom_base=np.zeros(3), T_map_base=np.zeros(3)))
     assert True not in told

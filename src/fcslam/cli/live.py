@@ -98,8 +98,8 @@ def drive_live(
         heard = ", ".join((*topics.scans, topics.odometry or topics.transforms[0]))
         notify(f"{robot.name}: reads {heard}; Ctrl-C ends the drive and writes {output}")
         with stopping(node.stop):  # also while the run is written: a late SIGTERM must not lose it
-            with _learning(learning, robot, notify) as follow:
-                node.run(_watch(notify, follow))
+            with standstill_learning(learning, robot, notify) as follow:
+                node.run(pose_watch(notify, follow))
             if not node.scans:
                 notify("no scan was mapped; nothing is written")
                 return
@@ -127,7 +127,7 @@ def _finish(robot: "Robot", notify: Callable[[str], None]) -> FcslamError | None
 
 
 @contextmanager
-def _learning(
+def standstill_learning(
     plan: "RobotLearningPlan | None", robot: "Robot | LocalizedRobot", notify: Callable[[str], None]
 ) -> "Iterator[Callable[[RobotPose], None]]":
     """Let the robot learn while it stands still, if there is a plan for it; gives what follows its poses."""
@@ -151,7 +151,7 @@ def _learning(
         yield Standstill(stop, lambda: learning.set_idle(False)).follow
 
 
-def _watch(
+def pose_watch(
     notify: Callable[[str], None], follow: "Callable[[RobotPose], None]"
 ) -> "Callable[[int, RobotPose | None], None]":
     """Follow the poses of the scans, and print a line of progress for many scans."""

@@ -96,7 +96,7 @@ def play(
             signal.signal(signal.SIGTERM, signal.default_int_handler)  # service managers send it
             try:
                 with compiled(console), ProgressDisplay(console) as display:
-                    watch = _watch(display, console, survey.scan_count)
+                    watch = robot_watch(display, console, survey.scan_count)
                     stay = None if plan is None else partial(_learn, plan, console, display, watch)
                     play_records(robot, opened.records(), pace, watch, stay)
             except KeyboardInterrupt:
@@ -173,7 +173,7 @@ def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kB
     return hashlib.sha256(f"{inputs} {dump(settings)}".encode()).hexdigest()
 
 
-def _watch(display: "ProgressDisplay", console: "Console", total: int) -> "Callable[[RobotStatus], None]":
+def robot_watch(display: "ProgressDisplay", console: "Console", total: int) -> "Callable[[RobotStatus], None]":
     """Show the progress of ``total`` scans, and print each change of the connection and of the robot's localization."""
     before: RobotStatus | None = None
     waits = sends = False
