@@ -31,9 +31,9 @@ def main() -> None:
 def measured(log: Path, parts: int, repetitions: int, place: Path) -> list[tuple[str, float, float, int]]:
     from fcslam import sources
 
-    logs = [place / f"{number}.clf" for number in range(parts)]
+    logs = [place / f"{number}.mcap" for number in range(parts)]
     for path, part in zip(logs, sources.split(sources.open_source(log), parts), strict=True):
-        sources.write_carmen(path, part.records())
+        sources.write_bag(path, part.records())
     whole, begun = place / "whole", place / "begun"
     commands = {
         "all at once": (*logs, "-o", whole),

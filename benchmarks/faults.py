@@ -157,7 +157,7 @@ class Worlds:
     def _record(self, scenario: Scenario, folder: Path) -> tuple[list[Path], float]:
         from fcslam.lab.simulation.noise import LidarSettings
         from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
-        from fcslam.sources import write_carmen
+        from fcslam.sources import write_bag
 
         if scenario.log:
             return self._cut(scenario, folder)
@@ -165,21 +165,21 @@ class Worlds:
         settings = SimulationSettings(robots=scenario.robots, path_length_m=scenario.path_m, lidar=lidar, camera=None)
         logs, longest_s = [], 0.0
         for number, driven in enumerate(simulate_fleet(settings, self._seed).robots):
-            logs.append(folder / f"{driven.name}.clf")
+            logs.append(folder / f"{driven.name}.mcap")
             skew_s = number * SKEW_S * scenario.skewed
-            write_carmen(logs[-1], (replace(scan, stamp=scan.stamp + skew_s) for scan in driven.scans()))
+            write_bag(logs[-1], (replace(scan, stamp=scan.stamp + skew_s) for scan in driven.scans()))
             longest_s = max(longest_s, float(driven.stamps[-1] - driven.stamps[0]))
         return logs, longest_s
 
     def _cut(self, scenario: Scenario, folder: Path) -> tuple[list[Path], float]:
-        from fcslam.sources import open_source, split, write_carmen
+        from fcslam.sources import open_source, split, write_bag
 
         path = common.log_path(common.recordings(f"slam-benchmark/{scenario.log}.clf.xz"), scenario.log)
         logs, longest_s = [], 0.0
         for part in split(open_source(path), scenario.robots):
-            logs.append(folder / f"{part.name.replace('.', '-')}.clf")
+            logs.append(folder / f"{part.name.replace('.', '-')}.mcap")
             records = list(part.records())
-            write_carmen(logs[-1], records)
+            write_bag(logs[-1], records)
             longest_s = max(longest_s, records[-1].stamp - records[0].stamp)
         return logs, longest_s
 

@@ -50,7 +50,7 @@ from fcslam.service.intake import Intake
 from fcslam.service.shared.mission_tables import MissionTables
 from fcslam.service.shared.registry import Registry
 from fcslam.service.shared.schema import prepare
-from fcslam.sources import open_source, write_carmen
+from fcslam.sources import open_source, write_bag
 from fcslam.storage.postgres import Postgres, take_password
 from fcslam.wire.batches import MEDIA_TYPE, write_batch
 from fcslam.wire.packets import decode, encode
@@ -87,8 +87,8 @@ def building(number: int, place: Path) -> Building:
     logs, packets = [], {}
     for robot in simulate_fleet(settings, SEED + number).robots:
         name = f"b{number}-{robot.name}"
-        logs.append(place / f"{name}.clf")
-        write_carmen(logs[-1], robot.scans())
+        logs.append(place / f"{name}.mcap")
+        write_bag(logs[-1], robot.scans())
         source, frontend = open_source(logs[-1]), RobotFrontend(name, RobotConfig())
         sent = [packet for record in source.records() for packet in frontend.process(record)]
         packets[name] = [encode(packet) for packet in sent + frontend.finish()]

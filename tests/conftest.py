@@ -16,10 +16,10 @@ from fcslam.cloud.settings import FleetConfig
 from fcslam.features import network_check
 from fcslam.lab.simulation.recording import write_ground_truth
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
-from fcslam.sources import write_carmen
 from fcslam.storage import database
 from fcslam.wire.messages import Packet
 from tests import small_fleet
+from tests.carmen_logs import write_carmen
 from tests.postgres import HAS_POSTGRES, WHY_NOT, Server
 from tests.scripted import ScriptedMatcher
 

@@ -29,7 +29,8 @@ import yaml
 from fcslam import open_run
 from fcslam.cli import main
 from fcslam.geometry import se2
-from fcslam.sources import open_source, write_carmen
+from fcslam.sources import open_source
+from tests.carmen_logs import write_carmen
 from tests.lab.simulation.gl import require_gl
 from tests.live.same_thread import SameThread
 from tests.sources.test_bag_robots import fleet_bag
@@ -57,7 +58,7 @@ LOGS = {
 """Names that the pages use, and the sample log whose beginning stands for each."""
 BAGS = {
     "run1.bag": ANNA, "monday/run.bag": ANNA, "robot2.mcap": BEN, "run2.bag": BEN, "tuesday/run.bag": BEN,
-    "robot2.fcslam": BEN, "robot2.bag": BEN, "day.mcap": CLEO, "today.bag": CLEO,
+    "robot2.bag": BEN, "day.mcap": CLEO, "today.bag": CLEO,
 }  # fmt: skip
 NEXT_YEAR = f"{datetime.datetime.now(datetime.UTC).year + 1}-01-31"
 SUBSTITUTES = {"/etc/fcslam/": "credentials/", "2027-01-31": NEXT_YEAR, "--speed 4": "--speed 100"}

@@ -201,14 +201,14 @@ def test_the_pages_on_algorithms_name_every_equation_and_line():
     assert len(SYMBOL.findall(text)) > 40
 
 
-def test_the_documented_example_writes_a_log_that_can_be_read(tmp_path, monkeypatch):
+def test_the_documented_example_writes_a_bag_that_can_be_read(tmp_path, monkeypatch):
     from fcslam.sources import open_source
 
     text = (ROOT / "docs" / "howto" / "logs.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     exec(compile(example, "logs.md", "exec"), {})
-    assert open_source(tmp_path / "robot1.clf.gz").survey().scan_count == 20
+    assert open_source(tmp_path / "robot1.mcap").survey().scan_count == 20
 
 
 @pytest.mark.parametrize(

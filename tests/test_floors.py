@@ -15,10 +15,11 @@ from fcslam.mission.localization import read_map
 from fcslam.mission.mission_file import edit_mission
 from fcslam.records import LaserScan, ManualClosure
 from fcslam.runs import open_run, separations
-from fcslam.sources import open_source, write_carmen
+from fcslam.sources import open_source
 from fcslam.storage.state_file import read_state, write_state
 from fcslam.wire.messages import Hello
 from tests import small_fleet
+from tests.carmen_logs import write_carmen
 from tests.mission.test_mission_file import contents
 from tests.small_fleet import feed, fingerprint, in_order, map_of
 

@@ -127,7 +127,7 @@ def test_rooms_import_only_rooms_above():
         ("sources/logs/carmen.py", "from fcslam.graph import pose_graph", True),
         ("learning/trainer.py", "from fcslam.features import codes", False),
         ("learning/trainer.py", "from fcslam.cloud import fleet", True),
-        ("lab/simulation/world.py", "from fcslam.sources import write_carmen", False),
+        ("lab/simulation/world.py", "from fcslam.sources import write_bag", False),
         ("lab/simulation/world.py", "from fcslam.graph import optimizer", True),
         ("mission/mission.py", "from fcslam.lab.evaluation import relations", True),
         ("cli/map.py", "from fcslam import __version__, mission", False),

@@ -12,7 +12,7 @@ from fcslam.errors import InputError
 from fcslam.mission.driving import side_by_side
 from fcslam.robot.backend_runner import worker_process
 from fcslam.robot.frontend import RobotConfig
-from fcslam.sources import Recording, open_source
+from fcslam.sources import open_source
 
 
 def let_semaphores_fail(monkeypatch, number):
@@ -32,8 +32,8 @@ def verify():
         pass
 
 
-def drive(tmp_path):
-    with side_by_side(2)([Recording(tmp_path, name) for name in ("a", "b")], RobotConfig()):
+def drive(logs):
+    with side_by_side(2)([open_source(log) for log in logs[:2]], RobotConfig()):
         pass
 
 
@@ -43,9 +43,9 @@ def test_workers(no_semaphores, start):
         start()
 
 
-def test_robots_side_by_side(no_semaphores, tmp_path):
+def test_robots_side_by_side(no_semaphores, logs):
     with pytest.raises(InputError, match="/dev/shm: more than one process needs semaphores"):
-        drive(tmp_path)
+        drive(logs)
 
 
 def test_a_single_robot_does_without(no_semaphores, logs):

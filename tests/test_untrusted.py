@@ -41,9 +41,7 @@ OWN = {
     "page/report.py": "files of the package",
     "page/routes.py": "files of the package",
     "service": "the folder of the service",
-    "sources/logs/carmen_writer.py": "the log that this process writes",
     "sources/bags/mcap_records.py": "the recording that this process writes",
-    "sources/recording/writer.py": "the recording that this process writes",
     "storage": "the folder of the service or of this user",
     "wire/prediction.py": "files of the package",
 }

@@ -58,30 +58,36 @@ class Case:
     arguments: tuple[str, ...]
 
 
-def cases(data: Path, work: Path, bags: Path) -> Iterator[Case]:
-    """All cases; ``bags`` are the runs of Wean Hall. The fleet with cameras is recorded once, by BEFORE."""
+SIMULATE = "tools", "simulate", "--robots", "3", "--seed", "101", "--path-length", "40", "--output"
+
+
+def cases(data: Path, work: Path) -> Iterator[Case]:
+    """All cases; the runs of Wean Hall and the fleet with cameras are bags that AFTER made."""
     logs = data / "lidar" / "slam-benchmark"
     for name in ("intel", "fr079", "mit-csail"):
         yield Case(name, ("map", f"{logs / name}.clf.xz", "--output", "{output}"))
     yield Case("intel-3", ("map", str(logs / "intel.clf.xz"), "--split", "3", "--output", "{output}"))
-    runs = [str(bags / f"robotdata{number}.mcap") for number in range(1, 6)]
+    runs = [str(work / "wean-hall" / f"robotdata{number}.mcap") for number in range(1, 6)]
     yield Case("wean-hall", ("map", *runs, "--output", "{output}"))
-    simulate = ("tools", "simulate", "--robots", "3", "--seed", "101", "--path-length", "40", "--output", "{output}")
-    yield Case("simulate", simulate)
-    fleet = [str(work / "before" / "simulate" / f"robot_{number}") for number in range(1, 4)]
+    yield Case("simulate", (*SIMULATE, "{output}"))
+    fleet = [str(work / "fleet" / f"robot_{number}") for number in range(1, 4)]
     yield Case("cameras", ("map", *fleet, "--output", "{output}"))
     robots = [str(data / "vision" / name) for name in ("kodak24", "sun_hays80")]
     federate = ("tools", "federate", "local", *robots, "--quick", "--config", "rounds=2", "--output", "{output}")
     yield Case("federated", federate)
 
 
-def converted(data: Path, checkout: Path, place: Path) -> Path:
-    """The runs of Wean Hall as bags, in ``place``."""
+def make_bags(data: Path, checkout: Path, work: Path) -> None:
+    """Write the bags that both checkouts map into ``work``, unless they are there."""
     logs = sorted((data / "lidar" / "wean-hall").glob("*.log.gz"))
-    if not place.exists():
-        command = [sys.executable, checkout / "benchmarks" / "convert_logs.py", *logs, "-o", place]
-        subprocess.run(command, env={**os.environ, "PYTHONPATH": str(checkout / "src")}, check=True)
-    return place
+    script = "import sys; from fcslam.cli import main; sys.exit(main(sys.argv[1:]))"
+    for folder, command in (
+        ("wean-hall", [checkout / "benchmarks" / "convert_logs.py", *logs, "--output"]),
+        ("fleet", ["-c", script, *SIMULATE]),
+    ):
+        if not (work / folder).exists():
+            environment = {**os.environ, "PYTHONPATH": str(checkout / "src")}
+            subprocess.run([sys.executable, *command, work / folder], env=environment, check=True)
 
 
 def run(case: Case, checkout: Path, place: Path) -> None:
@@ -137,8 +143,8 @@ def main() -> None:
     work = chosen.work.resolve()
     shutil.rmtree(work / "after", ignore_errors=True)
     data, different = Path(os.environ["FCSLAM_DATA"]), 0
-    bags = converted(data, chosen.after.resolve(), work / "bags")
-    for case in cases(data, work, bags):
+    make_bags(data, chosen.after.resolve(), work)
+    for case in cases(data, work):
         if chosen.cases and case.name not in chosen.cases:
             continue
         run(case, chosen.before.resolve(), work / "before")

@@ -254,19 +254,6 @@ SensorRecord = LaserScan | Odometry | CameraImage | GnssFix
 """A record of one of a robot's sensors."""
 
 
-@dataclass(frozen=True, slots=True)
-class GroundTruth:
-    """The robot's true pose in the frame ``building``, for evaluation only."""
-
-    stamp: float
-    T_building_base: FloatArray
-    """Shape (3,)."""
-
-
-RecordedItem = SensorRecord | GroundTruth
-"""An item of a recording."""
-
-
 class KeyscanId(NamedTuple):
     """Identifier of a keyscan in the fleet."""
 

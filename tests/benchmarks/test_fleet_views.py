@@ -13,7 +13,6 @@ from fcslam.records import (
     CameraModel,
     Channel,
     ClosureStatus,
-    GroundTruth,
     LaserModel,
     LaserScan,
     Reason,
@@ -21,8 +20,8 @@ from fcslam.records import (
     Transform,
     frozen,
 )
-from fcslam.runs import ClosureRow, RobotTrajectory, Run, read_tum
-from fcslam.sources import RecordingWriter
+from fcslam.runs import ClosureRow, RobotTrajectory, Run, read_tum, write_tum
+from fcslam.sources import write_bag
 
 LASER = LaserModel(360, -np.pi, 2.0 * np.pi / 360, 30.0)
 CAMERA = CameraModel(64, 48, 40.0, 40.0, 31.5, 23.5, Transform((0.0, 0.0, 0.5), (-0.5, 0.5, -0.5, 0.5)))
@@ -83,20 +82,21 @@ def test_where_nothing_comes_back_nothing_is_judged():
 
 def record(folder, poses, camera=CAMERA):
     """A scan and an image at each pose; a first image before any scan, and a last pose without an image."""
-    with RecordingWriter.create(folder, (LASER,), camera) as writer:
-        picture = cv2.imencode(".png", np.zeros((CAMERA.height, CAMERA.width), np.uint8))[1].tobytes()
-        for k, pose in enumerate(poses):
-            if camera is not None and k < len(poses) - 1:
-                writer.write(CameraImage(0.1 * k, picture, camera, None))
-            writer.write(LaserScan(0.1 * k, frozen(ranges_from(pose), np.float32), LASER, frozen(np.zeros(3))))
-            writer.write(GroundTruth(0.1 * k, frozen(pose)))
+    picture = cv2.imencode(".png", np.zeros((CAMERA.height, CAMERA.width), np.uint8))[1].tobytes()
+    records = []
+    for k, pose in enumerate(poses):
+        if camera is not None and k < len(poses) - 1:
+            records.append(CameraImage(0.1 * k, picture, camera, None))
+        records.append(LaserScan(0.1 * k, frozen(ranges_from(pose), np.float32), LASER, frozen(np.zeros(3))))
+    write_bag(folder, records)
+    write_tum(folder / "ground_truth.tum", 0.1 * np.arange(len(poses)), np.array(poses))
     return folder
 
 
 @pytest.fixture
 def fleet(tmp_path):
     """Two robots on one way, the second one further on and back again."""
-    there = np.column_stack((np.arange(0.6, 3.4, 0.1), np.full(28, 5.0), np.zeros(28)))
+    there = np.column_stack((0.6 + 0.101 * np.arange(28), np.full(28, 5.0), np.zeros(28)))
     turn = np.column_stack((np.full(32, 3.3), np.full(32, 5.0), np.arange(0.1, 3.25, 0.1)))
     record(tmp_path / "a", there)
     record(tmp_path / "b", np.concatenate((there, turn)))

@@ -5,8 +5,8 @@ import pytest
 from evaluation.place_features import PlaceFeatures, describe_recording, planar_inliers
 
 from fcslam.geometry import se2
-from fcslam.sources import write_carmen
 from tests import small_fleet
+from tests.carmen_logs import write_carmen
 
 
 @pytest.mark.slow

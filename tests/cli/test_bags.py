@@ -9,10 +9,10 @@ import pytest
 from fcslam.cli import main
 from fcslam.records import LaserScan, Sweep
 from fcslam.runs import read_tum
-from fcslam.sources import open_source, write_recording
+from fcslam.sources import open_source, write_bag
 from tests.sources import carmen_text
 from tests.sources.bag_messages import drive, mounted, odom, save, scan, text
-from tests.sources.camera_records import CAMERA, LASER
+from tests.sources.camera_records import CAMERA
 from tests.sources.camera_records import drive as camera_drive
 
 pytestmark = pytest.mark.slow
@@ -61,14 +61,6 @@ def test_a_bag_made_of_a_log_gives_the_same_trajectory(logs, from_log, tmp_path,
     stamps, poses = read_tum(tmp_path / "out" / "trajectories" / "robot.tum")
     np.testing.assert_allclose(stamps, from_log[0], atol=1e-9)
     assert np.hypot(*(poses - from_log[1])[:, :2].T).max() < 1e-3
-
-
-def test_a_recording_made_of_a_log_gives_the_same_trajectory_to_the_bit(logs, from_log, tmp_path):
-    assert run("record", logs[0], "-o", tmp_path / "robot.fcslam") == 0
-    assert run("map", tmp_path / "robot.fcslam", "-o", tmp_path / "out") == 0
-    stamps, poses = read_tum(tmp_path / "out" / "trajectories" / "robot.tum")
-    np.testing.assert_array_equal(stamps, from_log[0])
-    np.testing.assert_array_equal(poses, from_log[1])
 
 
 def test_a_robot_that_stands_still_makes_one_small_map(tmp_path):
@@ -181,16 +173,14 @@ def test_bad_bags_leave_nothing(tmp_path, capsys):
     }
     for path, reason in bad.items():
         assert reason in refused(capsys, "map", path, "-o", tmp_path / "out")
-        assert reason in refused(capsys, "record", path, "-o", tmp_path / "out.clf")
+        assert reason in refused(capsys, "record", path, "-o", tmp_path / "out.mcap")
     assert {path.name for path in tmp_path.iterdir()} == {path.name for path in bad}
 
 
 # fcslam record, of a recording
 
 
-@pytest.mark.parametrize(
-    "name", ["a.clf", "a.log.gz", "a.clf.xz", "a.clf.bz2", "a.bag", "a.mcap", "a.db3", "folder", "a.fcslam"]
-)
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap", "a.db3", "folder"])
 def test_every_format_can_be_written_and_read(tmp_path, bag, name, capsys):
     output = tmp_path / "deep" / name
     assert run("record", bag, "-o", output) == 0
@@ -203,11 +193,11 @@ def test_options_choose_what_is_converted(tmp_path):
     said = [*drive(40), *(scan(100 + k, topic="/other") for k in range(7))]
     bag = save(tmp_path / "run.bag", said)
     options = ("--sensors", "scan-topic=/other", "--sensors", "laser-pose=1,0,0")
-    assert run("record", bag, "-o", tmp_path / "other.clf", *options) == 0
-    assert open_source(tmp_path / "other.clf").survey().scan_count == 7
+    assert run("record", bag, "-o", tmp_path / "other.mcap", *options) == 0
+    assert open_source(tmp_path / "other.mcap").survey().scan_count == 7
 
 
-@pytest.mark.parametrize("name", ["a.clf", "a.bag", "folder", "a.fcslam"])
+@pytest.mark.parametrize("name", ["a.bag", "folder"])
 def test_only_force_replaces(tmp_path, bag, capsys, name):
     output = tmp_path / name
     assert run("record", bag, "-o", output) == 0
@@ -219,38 +209,26 @@ def test_only_force_replaces(tmp_path, bag, capsys, name):
     assert open_source(output).survey().scan_count == 12
 
 
-def test_the_times_of_beams_are_lost_in_a_carmen_log_alone(tmp_path, capsys):
+def test_images_and_times_of_beams_are_kept(tmp_path):
     spun = [replace(item, sweep=Sweep(0.0, 0.1)) if isinstance(item, LaserScan) else item for item in camera_drive()]
-    write_recording(tmp_path / "run.fcslam", (LASER,), CAMERA, spun)
-    said = "run.clf: a CARMEN log has no place for the times of beams, they are lost"
-    for name, is_told in (("run.mcap", False), ("run.clf", True)):
-        assert run("record", tmp_path / "run.fcslam", "-o", tmp_path / name) == 0
-        assert (said in capsys.readouterr().err) is is_told
-    assert all(item.sweep for item in open_source(tmp_path / "run.mcap").records() if isinstance(item, LaserScan))
-    assert run("record", tmp_path / "run.clf", "-o", tmp_path / "again.clf") == 0
-    assert "times of beams" not in capsys.readouterr().err
-
-
-def test_images_go_where_there_is_a_place_for_them(tmp_path, capsys):
-    write_recording(tmp_path / "run.fcslam", (LASER,), CAMERA, camera_drive())
-    assert run("record", tmp_path / "run.fcslam", "-o", tmp_path / "run.mcap") == 0
-    assert "images" not in capsys.readouterr().err
-    assert open_source(tmp_path / "run.mcap").survey().camera == CAMERA
-    assert run("record", tmp_path / "run.mcap", "-o", tmp_path / "run.clf") == 0
-    assert "run.clf: a CARMEN log has no place for images, they are left out" in capsys.readouterr().err
-    assert open_source(tmp_path / "run.clf").survey().scan_count == 20
+    write_bag(tmp_path / "run.bag", spun)
+    assert run("record", tmp_path / "run.bag", "-o", tmp_path / "run.mcap") == 0
+    source = open_source(tmp_path / "run.mcap")
+    assert source.survey().camera == CAMERA
+    assert all(item.sweep for item in source.records() if isinstance(item, LaserScan))
 
 
 def test_what_convert_refuses(tmp_path, bag, capsys):
-    assert "a.zip: unknown format" in refused(capsys, "record", bag, "-o", tmp_path / "a.zip")
+    for name in ("a.zip", "a.clf"):
+        assert f"{name}: unknown format" in refused(capsys, "record", bag, "-o", tmp_path / name)
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "main.tex").touch()
     assert "not a recording" in refused(capsys, "record", bag, "-o", tmp_path / "thesis", "--force")
     assert (tmp_path / "thesis" / "main.tex").exists()
     (tmp_path / "dir.bag").mkdir()
     assert "is a folder" in refused(capsys, "record", bag, "-o", tmp_path / "dir.bag", "--force")
-    assert "cannot be written" in refused(capsys, "record", bag, "-o", bag / "a.clf")
-    assert "no such file" in refused(capsys, "record", tmp_path / "none.bag", "-o", tmp_path / "a.clf")
+    assert "cannot be written" in refused(capsys, "record", bag, "-o", bag / "a.mcap")
+    assert "no such file" in refused(capsys, "record", tmp_path / "none.bag", "-o", tmp_path / "a.mcap")
 
 
 def test_a_log_without_a_clock_before_zero_cannot_be_a_bag(tmp_path, capsys):
@@ -261,5 +239,5 @@ def test_a_log_without_a_clock_before_zero_cannot_be_a_bag(tmp_path, capsys):
 
 def test_a_name_that_is_too_long_is_one_line(logs, tmp_path, capsys):
     long = "a" * 300
-    assert "name too long" in refused(capsys, "record", f"robot={long}.bag", "-o", tmp_path / "out.clf")
+    assert "name too long" in refused(capsys, "record", f"robot={long}.bag", "-o", tmp_path / "out.mcap")
     assert "name too long" in refused(capsys, "record", logs[0], "-o", tmp_path / f"{long}.bag")

@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.records import LaserModel, LaserScan
-from fcslam.sources import write_carmen
+from tests.carmen_logs import write_carmen
 from tests.sources.bag_messages import drive, save, scan
 
 pytestmark = pytest.mark.slow

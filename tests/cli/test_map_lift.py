@@ -4,7 +4,7 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.runs import open_run
-from fcslam.sources import write_carmen
+from tests.carmen_logs import write_carmen
 from tests.robot.lifting import ride
 
 pytestmark = pytest.mark.slow

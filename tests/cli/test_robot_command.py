@@ -24,10 +24,11 @@ from fcslam.ros.addresses import RosAddress
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.topics import SensorTopics
 from fcslam.runs import read_tum
-from fcslam.sources import BagOptions, write_carmen
+from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import ODOMETRY, SCAN
 from fcslam.wire.packets import decode
 from tests import small_fleet
+from tests.carmen_logs import write_carmen
 from tests.live.same_thread import SameThread
 from tests.robot.fake_cloud import FakeCloud
 from tests.robot.http_cloud import serving

@@ -36,11 +36,12 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.service.detectors import DetectorStore
-from fcslam.sources import open_source, write_bag, write_carmen, write_recording
+from fcslam.sources import open_source, write_bag
 from fcslam.storage.database import seal
 from fcslam.untrusted import STEPS, step_counter
 from fcslam.wire.batches import MEDIA_TYPE, read_batch, write_batch
 from fcslam.wire.packets import decode, encode, read_label
+from tests.carmen_logs import write_carmen
 from tests.fuzz.mutations import NUMBERS, TOKENS, mutate
 from tests.fuzz.packets import BREAKERS, packets_of_every_kind
 from tests.scripted import rectangle, stream
@@ -119,8 +120,8 @@ def logs(folder: Path) -> Iterator[Target]:
 
 @contextmanager
 def bags(folder: Path) -> Iterator[Target]:
-    """ROS bags and recording folders: surveyed and read to the end."""
-    yield _recordings(folder, ("bag.bag", "bag.mcap", "bag.db3", "bag", "recording.fcslam"))
+    """ROS bags: surveyed and read to the end."""
+    yield _recordings(folder, ("bag.bag", "bag.mcap", "bag.db3", "bag"))
 
 
 def _recordings(folder: Path, names: Sequence[str]) -> Target:
@@ -133,10 +134,8 @@ def _recordings(folder: Path, names: Sequence[str]) -> Target:
     for name in names:
         if name.startswith("log"):
             write_carmen(valid / name, scans)
-        elif name.startswith("bag"):
-            write_bag(valid / name, scans)
         else:
-            write_recording(valid / name, [laser], None, scans)
+            write_bag(valid / name, scans)
     corpus = _contents(valid)
 
     def read(path: Path) -> None:

@@ -17,7 +17,7 @@ from fcslam.live.records import Wiring
 from fcslam.records import LaserModel, LaserScan, Sweep, frozen
 from fcslam.robot.calibrating import calibrate_bag, calibrated, contradictions_of
 from fcslam.sources import BagOptions, open_source, write_bag
-from fcslam.sources.logs.carmen_writer import write_carmen
+from tests.carmen_logs import write_carmen
 from tests.lidar import worlds
 from tests.live.same_thread import SameThread
 

@@ -15,8 +15,8 @@ from fcslam.records import LaserModel, frozen
 from fcslam.robot.calibrating import calibrated
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source, write_bag
-from fcslam.sources.logs.carmen_writer import write_carmen
 from fcslam.sources.returns import FloorLine
+from tests.carmen_logs import write_carmen
 from tests.lidar import worlds
 
 pytestmark = pytest.mark.slow

@@ -11,8 +11,8 @@ from fcslam.geometry import se2
 from fcslam.live.records import Wiring
 from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
 from fcslam.mission.localization import read_map
-from fcslam.sources import write_carmen
 from tests import small_fleet
+from tests.carmen_logs import write_carmen
 from tests.live.same_thread import SameThread
 from tests.robot.test_map_localizer import Recorded, errors, map_of
 

@@ -13,8 +13,9 @@ from fcslam.errors import FcslamError, InputError
 from fcslam.geometry import se2
 from fcslam.live.records import Wiring
 from fcslam.robot.frontend import RobotFrontend
-from fcslam.sources import open_source, write_carmen
+from fcslam.sources import open_source
 from tests import small_fleet
+from tests.carmen_logs import write_carmen
 from tests.lidar import worlds
 from tests.live.same_thread import SameThread
 from tests.robot.kidnapping import drives, kidnapping

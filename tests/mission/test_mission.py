@@ -12,8 +12,9 @@ from fcslam.mission import mission
 from fcslam.mission.mission import MissionConfig, MissionInputs, continued_config, run_mission
 from fcslam.mission.mission_file import EMPTY
 from fcslam.records import Channel, ClosureStatus, Veto
-from fcslam.sources import open_source, write_carmen
+from fcslam.sources import open_source
 from fcslam.sources.faults import Faults
+from tests.carmen_logs import write_carmen
 from tests.robot.kidnapping import kidnapping
 
 

@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 
-from fcslam.records import CameraImage, CameraModel, GroundTruth, LaserModel, LaserScan, Odometry, Transform, frozen
+from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odometry, Transform, frozen
 
 LASER = LaserModel(12, -math.pi, math.tau / 12, 12.5, (-0.1, 0.05, 0.4))
 CAMERA = CameraModel(8, 6, 7.25, 7.5, 3.5, 2.5, Transform((0.1, -0.02, 0.3), (-0.5, 0.5, -0.5, 0.5)))
@@ -32,14 +32,13 @@ def scan(stamp, pose=(0.0, 0.0, 0.0), ranges=2.0):
 
 
 def drive(count=20, start=100.0):
-    """Odometry, a scan, an image and the truth at each of ``count`` places."""
+    """Odometry, a scan and an image at each of ``count`` places."""
     records = []
     for k in range(count):
         stamp, pose = start + 0.25 * k, (0.125 * k, 0.0, 0.0)
         records.append(Odometry(stamp, frozen(pose)))
         records.append(scan(stamp, pose))
         records.append(image(stamp, pose, png(shade=k % 256)))
-        records.append(GroundTruth(stamp, frozen((1.0 + 0.125 * k, 2.0, 0.0))))
     return records
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from fcslam.errors import SourceError
-from fcslam.sources import BagOptions, write_recording
+from fcslam.sources import BagOptions, write_bag
 from fcslam.sources.inspection import inspect
 from tests.sources import camera_records, carmen_text
 from tests.sources.bag_messages import BEAMS, LASER_POSE, drive, mounted, odom, save, scan, text
@@ -65,10 +65,10 @@ def test_a_carmen_log_has_no_topics(tmp_path):
     assert found.path_length_m > 0.0
 
 
-def test_a_recording_folder_shows_its_camera(tmp_path):
-    write_recording(tmp_path / "run", (camera_records.LASER,), camera_records.CAMERA, camera_records.drive(20))
-    found = inspect(tmp_path / "run")
-    assert (found.format, found.scans, found.images, found.odometry) == ("recording folder", 20, 20, 20)
+def test_a_bag_shows_its_camera(tmp_path):
+    write_bag(tmp_path / "run.mcap", camera_records.drive(20))
+    found = inspect(tmp_path / "run.mcap")
+    assert (found.format, found.scans, found.images, found.odometry) == ("ROS bag", 20, 20, 20)
     assert found.camera == camera_records.CAMERA
 
 

@@ -7,16 +7,8 @@ import pytest
 
 from fcslam.errors import SourceError
 from fcslam.records import Beams, LaserModel, LaserScan, frozen
-from fcslam.sources import (
-    BagOptions,
-    Fault,
-    FaultCount,
-    open_fleet,
-    open_source,
-    write_bag,
-    write_carmen,
-    write_recording,
-)
+from fcslam.sources import BagOptions, Fault, FaultCount, open_fleet, open_source, write_bag
+from tests.carmen_logs import write_carmen
 from tests.sources.bag_messages import drive, mounted, odom, pose_at, scan, tf
 from tests.sources.bag_messages import save as save_bag
 from tests.sources.carmen_text import flaser, robotlaser, save, scans_of
@@ -51,13 +43,10 @@ def scans(lasers, cycles=6):
 
 
 @pytest.mark.parametrize("kind", [interleaved, jittering], ids=["interleaved", "jittering"])
-@pytest.mark.parametrize("name", ["run.fcslam", "run.clf", "run.bag", "run.mcap"])
+@pytest.mark.parametrize("name", ["run.clf", "run.bag", "run.mcap"])
 def test_every_format_keeps_the_beams_of_each_scan(tmp_path, kind, name):
     written = scans(kind())
-    if name.endswith(".fcslam"):
-        write_recording(tmp_path / name, [written[0].laser], None, written)
-    else:
-        (write_carmen if name.endswith(".clf") else write_bag)(tmp_path / name, written)
+    (write_carmen if name.endswith(".clf") else write_bag)(tmp_path / name, written)
     source = open_source(tmp_path / name)
     read = scans_of(source)
     assert source.survey().scan_count == len(read) == len(written)
@@ -226,24 +215,13 @@ def test_poses_of_lasers_by_hand(tmp_path):
     assert tuple(laser.T_base_laser for laser in lasers) == poses
 
 
-@pytest.mark.parametrize("name", ["run.fcslam", "run.mcap"])
-def test_a_recording_and_a_bag_hold_several_lasers(tmp_path, name):
+def test_a_bag_holds_several_lasers(tmp_path):
     written = scans([SICK, REAR])
-    if name.endswith(".fcslam"):
-        write_recording(tmp_path / name, [SICK, REAR], None, written)
-        source = open_source(tmp_path / name)
-    else:
-        write_bag(tmp_path / name, written)
-        source = open_source(tmp_path / name, BagOptions(scan_topics=("/scan", "/scan_2")))
-    read = scans_of(source)
+    write_bag(tmp_path / "run.mcap", written)
+    read = scans_of(open_source(tmp_path / "run.mcap", BagOptions(scan_topics=("/scan", "/scan_2"))))
     mountings = np.array([scan.laser.T_base_laser for scan in read])
     np.testing.assert_allclose(mountings, [(0.0, 0.0, 0.0), (-0.3, 0.0, math.pi)] * 6, atol=1e-9)
     assert all(np.array_equal(before.ranges_m, after.ranges_m) for before, after in zip(written, read, strict=True))
-
-
-def test_a_log_holds_one_laser(tmp_path):
-    write_carmen(tmp_path / "run.clf", scans([SICK, REAR]))
-    assert len(scans_of(open_source(tmp_path / "run.clf"))) == 6
 
 
 # Topics of a fleet

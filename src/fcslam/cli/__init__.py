@@ -130,7 +130,7 @@ fcslam edit place runs/building --match 1.5,2=0,0 --match 9,2.5=7.5,0
 fcslam record ros2:/robot1 -o day.mcap
 fcslam record ros2:/ -o day.mcap --duration 600
 fcslam record robot1.clf.gz -o robot1.bag
-fcslam record robot2.mcap -o robot2.clf.gz --sensors scan-topic=/front/scan
+fcslam record robot2.bag -o robot2.mcap --sensors scan-topic=/front/scan
 fcslam serve --data cloud --host 0.0.0.0 --credentials credentials
 fcslam demo --robots 4 --no-camera -o demo4
 fcslam evaluate fleet fleet/run --truth fleet

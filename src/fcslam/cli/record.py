@@ -1,6 +1,5 @@
 """`fcslam record`: write the sensors of a live robot, or of another recording, into a file."""
 
-import re
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import closing
@@ -22,12 +21,7 @@ if TYPE_CHECKING:
 
     from fcslam.cli.inputs import LiveSource
     from fcslam.records import SensorRecord
-    from fcslam.sources import Source, Survey
-
-_CARMEN = re.compile(r"\.(clf|log)(\.(gz|xz|bz2))?$")
-_RECORDING = ".fcslam"
-_FOLDER_MARKS = {"": "metadata.yaml", _RECORDING: "meta.yaml"}
-"""The file that marks a folder as a recording, which ``--force`` may replace; by suffix of the folder."""
+    from fcslam.sources import Source
 
 
 def record(
@@ -36,7 +30,7 @@ def record(
         typer.Argument(
             metavar="ADDRESS|LOG",
             help="A live robot: ros2:/NAMESPACE or zenoh:/NAMESPACE; ros2:/ has none. Or a recording, to write it in "
-            "another format.",
+            "as a bag.",
         ),
     ],
     *,
@@ -46,9 +40,8 @@ def record(
             "--output",
             "-o",
             metavar="FILE",
-            help="File to write. A live robot: .mcap. A recording: .clf or .log (and .gz, "
-            ".xz, .bz2) a CARMEN log, .bag a ROS 1 bag, .mcap or .db3 a ROS 2 bag, no suffix a ROS 2 bag folder, "
-            ".fcslam a recording folder.",
+            help="Bag to write. A live robot: .mcap. A recording: .mcap or .db3 a ROS 2 bag, .bag a ROS 1 bag, no "
+            "suffix a ROS 2 bag folder.",
         ),
     ],
     duration: Annotated[
@@ -59,7 +52,7 @@ def record(
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Record the sensors of a live robot: everything that `fcslam map` needs. Or convert a recording."""
+    """Record the sensors of a live robot: everything that `fcslam map` needs. Or convert a recording to a bag."""
     console = notices(quiet)
     if is_live(source):
         _record(live_source(source, sensors), output, duration, force, console)
@@ -94,20 +87,9 @@ def _record(live: "LiveSource", output: Path, duration: float | None, force: boo
 
 
 def _convert(log: str, output: Path, sensors: list[str] | None, force: bool, console: "Console") -> None:
-    from fcslam.records import LaserScan
-
     _prepare(output, force)
     source, survey = open_recording(log, sensors, console)
-    if _CARMEN.search(output.name):
-        first = next((record for record in source.records() if isinstance(record, LaserScan)), None)
-        for is_lost, what in (
-            (survey.camera is not None, "no place for images, they are left out"),
-            (len(survey.lasers) > 1, "a place for one laser, the scans of the others are left out"),
-            (first is not None and first.sweep is not None, "no place for the times of beams, they are lost"),
-        ):
-            if is_lost:
-                print_line(console, f"{output}: a CARMEN log has {what}")
-    _write(output, survey, _with_progress(source, survey.scan_count, console))
+    _write(output, _with_progress(source, survey.scan_count, console))
     print_faults(console, {source.name: source.faults})
     typer.echo(f"{survey.scan_count} scans: {output}")
 
@@ -116,32 +98,26 @@ def _prepare(output: Path, force: bool) -> None:
     """Check before the work that ``output`` can be written, and create its parents."""
     from fcslam.sources import BAG_SUFFIXES
 
-    if not (_CARMEN.search(output.name) or output.suffix in (*BAG_SUFFIXES, _RECORDING)):
-        raise OutputError(
-            f"{output}: unknown format; give .clf (.gz, .xz, .bz2), .bag, .mcap, .db3, .fcslam, or no suffix"
-        )
-    mark = _FOLDER_MARKS.get(output.suffix)
+    if output.suffix not in BAG_SUFFIXES:
+        raise OutputError(f"{output}: unknown format; give .mcap, .db3, .bag, or no suffix for a folder")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         if output.exists() and not force:
             raise OutputError(f"{output}: exists; choose another name or give --force to replace it")
-        if output.is_dir() and (mark is None or not (output / mark).is_file()):
+        if output.is_dir() and (output.suffix or not (output / "metadata.yaml").is_file()):
             raise OutputError(f"{output}: is a folder, not a recording; choose another name")
     except OSError as error:
         raise OutputError(f"{output}: cannot be written ({error}); choose another place") from error
 
 
-def _write(output: Path, survey: "Survey", records: "Iterable[SensorRecord]") -> None:
-    """Write into a temporary folder beside ``output`` and move the complete recording to its place."""
-    from fcslam.sources import write_bag, write_carmen, write_recording
+def _write(output: Path, records: "Iterable[SensorRecord]") -> None:
+    """Write into a temporary folder beside ``output`` and move the complete bag to its place."""
+    from fcslam.sources import write_bag
 
     try:
         with TemporaryDirectory(prefix=".", dir=output.parent) as staging:
             whole = Path(staging, output.name)
-            if output.suffix == _RECORDING:
-                write_recording(whole, survey.lasers, survey.camera, records)
-            else:
-                (write_carmen if _CARMEN.search(output.name) else write_bag)(whole, records)
+            write_bag(whole, records)
             if output.is_dir():
                 shutil.rmtree(output)
             whole.replace(output)

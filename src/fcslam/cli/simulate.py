@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
-    from fcslam.records import RecordedItem
+    from fcslam.records import SensorRecord
 
 
 def simulate(
@@ -93,7 +93,7 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Con
 
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.simulation.recording import record_robot, write_ground_truth
-    from fcslam.records import GroundTruth
+    from fcslam.records import Odometry
 
     began = time.perf_counter()
     recordings = [output / robot.name for robot in fleet.robots]
@@ -102,13 +102,13 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Con
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             advance, stopped = display.start("simulating", total), Event()
 
-            def watch(items: "Iterator[RecordedItem]") -> "Iterator[RecordedItem]":
-                """Count the records, until all robots are stopped. Each comes with its true pose."""
+            def watch(items: "Iterator[SensorRecord]") -> "Iterator[SensorRecord]":
+                """Count scans and images, until all robots are stopped."""
                 for item in items:
                     if stopped.is_set():
                         return
                     yield item
-                    if isinstance(item, GroundTruth):
+                    if not isinstance(item, Odometry):
                         advance()
 
             jobs = [

@@ -1,12 +1,9 @@
-"""Reads and writes recordings. ``open_source(path)`` reads every format as a stream of sensor records."""
+"""Reads recordings, and writes bags. ``open_source(path)`` reads every format as a stream of sensor records."""
 
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag
 from fcslam.sources.faults import Fault, FaultCount, Faults
 from fcslam.sources.formats import check_copies, open_fleet, open_source
-from fcslam.sources.logs.carmen_writer import write_carmen
-from fcslam.sources.recording.reader import Recording
-from fcslam.sources.recording.writer import RecordingWriter, write_recording
 from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
 from fcslam.sources.split import split
 
@@ -17,8 +14,6 @@ __all__ = [
     "Fault",
     "FaultCount",
     "Faults",
-    "Recording",
-    "RecordingWriter",
     "ScanRange",
     "Source",
     "Survey",
@@ -27,6 +22,4 @@ __all__ = [
     "open_source",
     "split",
     "write_bag",
-    "write_carmen",
-    "write_recording",
 ]

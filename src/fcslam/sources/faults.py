@@ -10,8 +10,6 @@ class Fault(StrEnum):
 
     BROKEN_LINE = "broken lines skipped"
     BROKEN_MESSAGE = "broken messages skipped"
-    BROKEN_RECORD = "damaged records skipped"
-    CUT_RECORD = "records cut off at the end of a file skipped"
     BROKEN_IMAGE = "missing or damaged images skipped"
     OTHER_BEAMS = "scans with the beams of another laser skipped"
     BAD_BEAMS = "scans whose ranges do not fit their angles skipped"
@@ -49,7 +47,7 @@ class FaultCount:
 
     count: int = 0
     first_line: int = 0
-    """Line (or message of its topic, or record of its file) of the first fault, counted from 1; 0 if unknown."""
+    """Line (or message of its topic) of the first fault, counted from 1; 0 if unknown."""
     largest_s: float = 0.0
     """Largest step back in time, for kinds of faults that have one."""
 

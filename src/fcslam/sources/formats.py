@@ -17,7 +17,6 @@ from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_e
 from fcslam.sources.logs.carmen import CARMEN, RAW_CARMEN
 from fcslam.sources.logs.dialect import Dialect
 from fcslam.sources.logs.textlog import TextLog
-from fcslam.sources.recording.reader import Recording, is_recording
 from fcslam.sources.source import Source
 from fcslam.untrusted import open_file
 
@@ -59,7 +58,6 @@ def _text_format(dialect: Dialect) -> Format:
 
 FORMATS: tuple[Format, ...] = (
     *map(_text_format, (RAW_CARMEN, CARMEN)),
-    Format("recording folder", is_recording, lambda path, name, _: Recording(path, name)),
     Format(_BAG, is_bag, RosBag),
 )
 """Tried in this order. To add a format, add an entry."""

@@ -113,7 +113,7 @@ def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_coun
         SourceError: it is mostly damaged, most scans are of another laser than the first ones, or its time jumps or
             runs back.
     """
-    broken = sum(faults[kind].count for kind in (Fault.BROKEN_LINE, Fault.BROKEN_MESSAGE, Fault.BROKEN_RECORD))
+    broken = sum(faults[kind].count for kind in (Fault.BROKEN_LINE, Fault.BROKEN_MESSAGE))
     other, contradictory, misplaced, reversals = (
         faults[kind] for kind in (Fault.OTHER_BEAMS, Fault.BAD_BEAMS, Fault.MISPLACED_SCAN, Fault.TIME_REVERSAL)
     )

@@ -98,20 +98,20 @@ def test_lighting_changes_pictures(flat):
 
 def test_a_recording_holds_images_in_order_and_the_scans_of_a_blind_fleet():
     seeing, blind = simulate_fleet(SMALL, 1), simulate_fleet(SMALL.model_copy(update={"camera": None}), 1)
-    items = list(seeing.robots[0].items())
+    items = list(seeing.robots[0].records())
     stamps = [item.stamp for item in items]
     assert stamps == sorted(stamps)
     images = [item for item in items if isinstance(item, CameraImage)]
     np.testing.assert_array_equal([image.stamp for image in images], seeing.robots[0].image_stamps)
     assert cv2.imdecode(np.frombuffer(images[0].encoded, np.uint8), cv2.IMREAD_COLOR).shape == (240, 320, 3)
     scans = [item.ranges_m for item in items if isinstance(item, LaserScan)]
-    alone = [item.ranges_m for item in blind.robots[0].items() if isinstance(item, LaserScan)]
+    alone = [item.ranges_m for item in blind.robots[0].records() if isinstance(item, LaserScan)]
     np.testing.assert_array_equal(scans, alone)
 
 
 def test_an_images_odometry_lies_between_that_of_the_scans_around_it():
     robot = simulate_fleet(SMALL, 1).robots[1]
-    for image in (item for item in robot.items() if isinstance(item, CameraImage)):
+    for image in (item for item in robot.records() if isinstance(item, CameraImage)):
         after = int(np.searchsorted(robot.stamps, image.stamp))
         before, next_one = robot.T_odom_base[after - 1 : after + 1]
         low, high = np.minimum(before, next_one)[:2] - 1e-3, np.maximum(before, next_one)[:2] + 1e-3
@@ -120,7 +120,7 @@ def test_an_images_odometry_lies_between_that_of_the_scans_around_it():
 
 def test_robots_side_by_side_see_what_they_see_alone():
     def images(robot, into):
-        into.append([item.encoded for item in robot.items() if isinstance(item, CameraImage)])
+        into.append([item.encoded for item in robot.records() if isinstance(item, CameraImage)])
 
     alone, together = [], [[], []]
     robots = simulate_fleet(SMALL, 1).robots
@@ -148,6 +148,6 @@ def test_robots_draw_one_after_the_other(monkeypatch):
     monkeypatch.setattr(module, "mjr_render", watched)
     fleet = simulate_fleet(SimulationSettings(path_length_m=2.0), 1)
     with ThreadPoolExecutor(3) as pool:
-        list(pool.map(lambda robot: [None for _ in robot.items()], fleet.robots))
+        list(pool.map(lambda robot: [None for _ in robot.records()], fleet.robots))
     assert len(most) > 20
     assert max(most) == 1

@@ -16,7 +16,7 @@ from fcslam.lab.simulation.options import Building
 from fcslam.lab.simulation.scene import bare_model
 from fcslam.lab.simulation.sensors import RayCaster
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
-from fcslam.records import GroundTruth, LaserModel, LaserScan
+from fcslam.records import LaserModel, LaserScan
 from tests.lab.simulation.driving import drive, route
 
 pytestmark = pytest.mark.slow
@@ -80,12 +80,12 @@ def test_a_round_column_lies_within_its_corners():
 def test_scans_and_truth_come_in_order():
     fleet = simulate_fleet(TINY, 1)
     for robot in fleet.robots:
-        items = list(robot.items())
+        items = list(robot.records())
         scans = [item for item in items if isinstance(item, LaserScan)]
-        truth = [item for item in items if isinstance(item, GroundTruth)]
+        stamps, truth = robot.truth
         np.testing.assert_array_equal([scan.stamp for scan in scans], robot.stamps)
-        np.testing.assert_array_equal([item.stamp for item in truth], robot.stamps)
-        np.testing.assert_allclose([item.T_building_base for item in truth], robot.T_building_base, atol=1e-5)
+        np.testing.assert_array_equal(stamps, robot.stamps)
+        np.testing.assert_allclose(truth, robot.T_building_base, atol=1e-5)
         np.testing.assert_array_equal([scan.T_odom_base for scan in scans], robot.T_odom_base)
         assert all(scan.ranges_m.shape == (60,) for scan in scans)
     assert len(set(np.concatenate([robot.stamps for robot in fleet.robots]))) == sum(
@@ -94,7 +94,7 @@ def test_scans_and_truth_come_in_order():
 
 
 def ranges(robot):
-    return np.array([item.ranges_m for item in robot.items() if isinstance(item, LaserScan)])
+    return np.array([item.ranges_m for item in robot.records() if isinstance(item, LaserScan)])
 
 
 def test_the_same_seed_gives_the_same_fleet_and_another_another():

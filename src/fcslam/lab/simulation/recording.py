@@ -15,14 +15,17 @@ from fcslam.geometry import se2
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings
 from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
-from fcslam.records import FloatArray, LaserModel, RecordedItem, frozen
-from fcslam.sources import RecordingWriter
+from fcslam.records import FloatArray, LaserModel, SensorRecord, frozen
+from fcslam.runs import write_tum
+from fcslam.sources import write_bag
 from fcslam.storage.files import write_file
 
 SETTINGS: Final = "simulation.yaml"
 """File with the settings of the fleet in a folder, which determine all its recordings."""
 
-Watch = Callable[[Iterator[RecordedItem]], Iterator[RecordedItem]]
+GROUND_TRUTH: Final = "ground_truth.tum"
+
+Watch = Callable[[Iterator[SensorRecord]], Iterator[SensorRecord]]
 
 RESOLUTION_M = 0.05
 
@@ -52,7 +55,7 @@ def prepare_fleet_folder(folder: Path, settings: SimulationSettings, seed: int) 
 
 
 def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter) -> None:
-    """Write the robot's recording to ``folder``.
+    """Write the robot's recording to ``folder``, a bag of ROS 2, and its true poses to ``GROUND_TRUTH`` in it.
 
     ``watch`` receives the records and passes them on; the recording ends when it ends.
 
@@ -60,9 +63,10 @@ def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter) -> No
         SimulationError: MuJoCo or, with a camera, a GL library is missing.
         OutputError: something is in the way, or cannot be written.
     """
-    with RecordingWriter.create(folder, robot.lasers, robot.camera) as writer, closing(robot.items()) as items:
-        for item in watch(items):
-            writer.write(item)
+    with closing(robot.records()) as records:
+        write_bag(folder, watch(records))
+    with writing(folder, "choose another output folder"):
+        write_tum(folder / GROUND_TRUTH, *robot.truth)
 
 
 class HasTruePoses(Protocol):

@@ -29,11 +29,10 @@ from fcslam.records import (
     CameraImage,
     CameraModel,
     FloatArray,
-    GroundTruth,
     LaserModel,
     LaserScan,
     Odometry,
-    RecordedItem,
+    SensorRecord,
     Transform,
     frozen,
 )
@@ -152,8 +151,14 @@ class SimulatedRobot:
             return Readings(np.empty(0), np.empty((0, 3)))
         return self.readings
 
-    def items(self) -> Generator[RecordedItem, None, None]:
-        """Scans, images and odometry in the order of time; a scan or an image is followed by the true pose.
+    @property
+    def truth(self) -> tuple[FloatArray, FloatArray]:
+        """The stamps (N,) of scans and images in the order of time, and the true poses (N, 3) at them."""
+        stamps = np.sort(np.concatenate((self.stamps, self.image_stamps)), kind="stable")
+        return stamps, self.route.at(stamps - self.first_stamp)
+
+    def records(self) -> Generator[SensorRecord, None, None]:
+        """Scans, images and odometry in the order of time.
 
         Raises:
             SimulationError: MuJoCo or, with a camera, a GL library is missing.
@@ -165,12 +170,8 @@ class SimulatedRobot:
             for k in np.argsort(stamps, kind="stable"):
                 if k >= end:
                     yield Odometry(float(stamps[k]), odometry.T_odom_base[k - end])
-                    continue
-                yield next(scans) if k < count else next(images)
-                yield self._truth(float(stamps[k]))
-
-    def _truth(self, stamp: float) -> GroundTruth:
-        return GroundTruth(stamp, frozen(self.route.at(np.array([stamp - self.first_stamp]))[0]))
+                else:
+                    yield next(scans) if k < count else next(images)
 
     def scans(self) -> Iterator[LaserScan]:
         """All scans; every call yields the same.

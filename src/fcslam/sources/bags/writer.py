@@ -15,9 +15,8 @@ from fcslam.records import (
     CameraModel,
     FloatArray,
     GnssFix,
-    GroundTruth,
     LaserScan,
-    RecordedItem,
+    SensorRecord,
     Transform,
 )
 from fcslam.sources.bags.codec import (
@@ -41,7 +40,7 @@ _ROS1, _MCAP, _SQLITE, _FOLDER = ".bag", ".mcap", ".db3", ""
 BAG_SUFFIXES = (_ROS1, _MCAP, _SQLITE, _FOLDER)
 """Formats of bags that can be written: ROS 1, two file formats of ROS 2, and a folder of ROS 2."""
 
-_ODOM, _BASE, _LASER, _CAMERA, _BUILDING = "odom", "base_link", "laser", "camera_optical_frame", "building"
+_ODOM, _BASE, _LASER, _CAMERA = "odom", "base_link", "laser", "camera_optical_frame"
 _GNSS = "gnss"
 _SCAN_TOPIC = "/scan"
 _FIRST_TOPICS = {"/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS, _SCAN_TOPIC: SCAN}
@@ -52,7 +51,7 @@ _END_OF_TIME_S = 2**31
 _NANOSECONDS = 10**9
 
 
-def write_bag(path: Path, records: Iterable[RecordedItem]) -> None:
+def write_bag(path: Path, records: Iterable[SensorRecord]) -> None:
     """Write ``records`` to ``path``; equal records give equal bytes.
 
     ``.bag`` is a ROS 1 bag, ``.mcap`` and ``.db3`` are files of ROS 2, a path without suffix is a new folder of
@@ -61,12 +60,12 @@ def write_bag(path: Path, records: Iterable[RecordedItem]) -> None:
     - /scan, and /scan_2 and so on of further lasers;
     - /odom and /tf (odom -> base_link): odometry, also that of each scan and image at its stamp;
     - /camera/image_raw/compressed: images as they are encoded, each with its /camera/camera_info;
-    - /tf_static (base_link -> laser, laser_2, camera_optical_frame): the mounting of lasers and camera;
-    - /ground_truth (building -> base_link).
+    - /tf_static (base_link -> laser, laser_2, camera_optical_frame): the mounting of lasers and camera.
 
     Header stamps are the records' own, to the nanosecond; the time of recording only ever grows. A scan whose beams
     were measured at different times has the stamp of the first one measured; if that is its last beam, the scan is
-    written clockwise. The motion during a scan is not written, as it follows from the odometry.
+    written clockwise. Ranges of the maximum or more are inf, no return. The motion during a scan is not written, as it
+    follows from the odometry.
 
     Raises:
         OutputError: the bag cannot be written, its kind is not known, or ROS has no such stamp.
@@ -117,14 +116,10 @@ class _Bag:
         """Of each laser."""
         self._latest_reading: tuple[float, ...] = ()
 
-    def write(self, item: RecordedItem) -> None:
+    def write(self, item: SensorRecord) -> None:
         """Write one record: its odometry, and its scan or image."""
         stamp_ns = _nanoseconds(item.stamp)
         self._bag_time_ns = max(self._bag_time_ns + 1, stamp_ns)
-        if isinstance(item, GroundTruth):
-            header = self._codec.header(stamp_ns, _BUILDING)
-            self._put("/ground_truth", ODOMETRY, self._odometry(header, item.T_building_base))
-            return
         if isinstance(item, GnssFix):
             self._put_fix(stamp_ns, item)
             return
@@ -207,7 +202,8 @@ class _Bag:
 
     def _scan(self, header: Any, scan: LaserScan) -> Any:
         count, first_rad, increment_rad = scan.laser.beams
-        last_rad, ranges_m = first_rad + scan.laser.beams.span_rad, scan.ranges_m
+        last_rad = first_rad + scan.laser.beams.span_rad
+        ranges_m = np.where(scan.ranges_m >= scan.laser.max_range_m, np.float32(np.inf), scan.ranges_m)
         beam_s = 0.0 if scan.sweep is None else scan.sweep.duration_s / (count - 1)
         if scan.sweep is not None and scan.sweep.last_s < scan.sweep.first_s:
             first_rad, last_rad, increment_rad, ranges_m = last_rad, first_rad, -increment_rad, ranges_m[::-1]

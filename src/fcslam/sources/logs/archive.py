@@ -17,7 +17,7 @@ MAX_LINE_BYTES = 1 << 18
 """Longer lines are split, so that a file without line ends does not fill the memory."""
 
 _HEAD_BYTES = 1 << 16
-_LOG_SUFFIX = re.compile(r"\.(gz|xz|bz2|clf|log|dat|txt|carmen|bag|mcap|db3|active|fcslam)$", re.IGNORECASE)
+_LOG_SUFFIX = re.compile(r"\.(gz|xz|bz2|clf|log|dat|txt|carmen|bag|mcap|db3|active)$", re.IGNORECASE)
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.-]+")
 
 
