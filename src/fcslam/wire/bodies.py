@@ -1,7 +1,6 @@
 """Conversion between records and protobuf messages, with writing and reading side by side."""
 
 from collections.abc import Callable, Sequence
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,8 +90,8 @@ def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
     channels = [read_channel(code) for code in codes]
     versions = {channel: each.version for channel, each in zip(channels, message.detectors, strict=True)}
     words = {channel: each.vocabulary for channel, each in zip(channels, message.detectors, strict=True)}
-    vocabularies = MappingProxyType({channel: digest for channel, digest in words.items() if digest})
-    return Hello(envelope.robot, envelope.epoch, lasers, MappingProxyType(versions), message.floor, vocabularies)
+    vocabularies = {channel: digest for channel, digest in words.items() if digest}
+    return Hello(envelope.robot, envelope.epoch, lasers, versions, message.floor, vocabularies)
 
 
 def _write_laser(laser: LaserModel) -> pb.Laser:
