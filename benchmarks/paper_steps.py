@@ -31,6 +31,8 @@ import common
 import numpy as np
 import simulated_fleet
 import yaml
+from evaluation.fleet_charts import fleet_charts
+from evaluation.fleet_figure import write_figure
 from evaluation.fleet_views import judge_views
 
 from fcslam.lab.presets import Preset
@@ -124,8 +126,9 @@ def measures(run: Path, fleet: Path, picture: Path | None = None) -> tuple[float
     """A run against the truth, as in ``MEASURES``; ``picture``: file of its figure 5."""
     with tempfile.TemporaryDirectory() as place:
         result = Path(place) / "result.json"
-        drawn = [] if picture is None else ["--figure", picture]
-        common.run_fcslam("evaluate", "fleet", run, "--truth", fleet, "--csv", result, *drawn)
+        common.run_fcslam("evaluate", "fleet", run, "--truth", fleet, "--csv", result)
+        if picture is not None:
+            write_figure(fleet_charts(run, fleet), picture)
         found = simulated_fleet.read(result)
     robots = [f"robot_{k + 1}" for k in range(simulated_fleet.ROBOTS)]
     matches, views = "inter_robot_verified_both", judge_views(run, fleet)[ClosureStatus.VERIFIED]

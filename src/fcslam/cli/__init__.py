@@ -134,7 +134,7 @@ fcslam record robot2.bag -o robot2.mcap --sensors scan-topic=/front/scan
 fcslam serve --data cloud --host 0.0.0.0 --credentials credentials
 fcslam demo --robots 4 --no-camera -o demo4
 fcslam evaluate fleet fleet/run --truth fleet
-fcslam evaluate fleet demo/run --csv fleet.csv --figure fleet.png
+fcslam evaluate fleet demo/run --csv fleet.csv
 fcslam evaluate relations runs/intel intel.relations.gz
 fcslam evaluate quality fleet/run
 fcslam tools simulate --building office --no-camera

@@ -1,10 +1,10 @@
-"""`fcslam demo`: simulate a fleet, map it, compare the map with the truth, and draw both."""
+"""`fcslam demo`: simulate a fleet, map it, and compare the map with the truth."""
 
 import shutil
 import time
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -14,12 +14,7 @@ from fcslam.cli.show import live_page
 from fcslam.errors import OutputError
 from fcslam.lab.simulation.options import Scanner
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from fcslam.lab.simulation.simulated_fleet import SimulatedFleet
-
-RECORDINGS, RUN, FIGURE, TABLE = "recordings", "run", "figure.png", "evaluation.csv"
+RECORDINGS, RUN, TABLE = "recordings", "run", "evaluation.csv"
 ABOUT = "about"
 """The file that marks a folder as the output of a demo, which the next demo may replace."""
 
@@ -36,7 +31,7 @@ def demo(
     live: Live = False,
     quiet: Quiet = False,
 ) -> None:
-    """Simulate robots with unknown starts, map them, compare the map with the truth, and draw both."""
+    """Simulate robots with unknown starts, map them, and compare the map with the truth."""
     from fcslam.cli.evaluate.fleet_tables import report_fleet
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
@@ -65,7 +60,7 @@ def demo(
     console = notices(quiet)
 
     def begin(stage: int, text: str) -> None:
-        print_line(console, f"{stage} of 4 {text}")
+        print_line(console, f"{stage} of 3 {text}")
 
     begin(1, f"simulate: {robots} robots drive {settings.path_length_m:g} m each; their starts are unknown")
     recordings = record_fleet(fleet, output / RECORDINGS, seed, console)
@@ -75,10 +70,8 @@ def demo(
         map_sources(sources, MissionConfig(seed=seed), MissionInputs(), output / RUN, console, force=True, page=page)
         begin(3, "evaluate: compare with the truth")
         report_fleet(output / RUN, output / RECORDINGS, output / TABLE, console)
-        begin(4, "draw")
-        _draw(output, fleet, console)
         typer.echo(f"{time.perf_counter() - began:.0f} s in all")
-        for content, name in (("run folder", RUN), ("figure", FIGURE), ("all numbers", TABLE)):
+        for content, name in (("run folder", RUN), ("map", f"{RUN}/map.png"), ("all numbers", TABLE)):
             typer.echo(f"{content}: {output / name}")
 
 
@@ -89,7 +82,7 @@ def _prepare(output: Path) -> None:
             raise OutputError(
                 f"{output}: holds something that is not a demo; remove it, or name another folder with --output"
             )
-        names = (RECORDINGS, RUN, FIGURE, TABLE)
+        names = (RECORDINGS, RUN, TABLE)
         (output / ABOUT).write_text(
             f"Written by `fcslam demo`, which replaces {', '.join(names)} here when it runs again.\n", encoding="utf-8"
         )
@@ -100,16 +93,3 @@ def _prepare(output: Path) -> None:
                 place.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
-
-
-def _draw(output: Path, fleet: "SimulatedFleet", console: "Console") -> None:
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.lab.evaluation.charts import fleet_charts
-    from fcslam.lab.evaluation.fleet_figure import Outline, write_figure
-    from fcslam.lab.simulation.floorplan import PieceKind
-
-    with ProgressDisplay(console) as display:
-        display.start("drawing")
-        solid = [piece for piece in fleet.plan.pieces if piece.kind is not PieceKind.LINTEL]
-        outlines = [Outline(piece.outline, piece.kind is not PieceKind.WALL) for piece in solid]
-        write_figure(fleet_charts(output / RUN, output / RECORDINGS, outlines), output / FIGURE)

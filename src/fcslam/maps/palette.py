@@ -11,7 +11,6 @@ FLOOR: Final = 0xFFFFFF
 WALL: Final = 0x1F2A33
 APPEARED: Final = 0xE66100
 DISAPPEARED: Final = 0x0072B2
-FURNITURE: Final = 0xB0BEC5
 INK: Final = 0x37474F
 # Distinguishable with colour vision deficiency (after Okabe and Ito).
 ROBOTS: Final = (0x0072B2, 0xE66100, 0x009E73, 0x7B4FB5, 0xE0A800, 0x56B4E9, 0x8C564B, 0x607D3B)

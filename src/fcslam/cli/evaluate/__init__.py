@@ -28,23 +28,11 @@ def fleet(
         ),
     ] = None,
     csv: Csv = None,
-    figure: Annotated[
-        Path | None,
-        typer.Option(help="PNG file to draw: the robots' maps, matched places, the fused map and the truth."),
-    ] = None,
 ) -> None:
     """Compare a run with the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
     from fcslam.cli.evaluate.fleet_tables import report_fleet
-    from fcslam.cli.progress import ProgressDisplay
 
     report_fleet(run, truth, csv, notices())
-    if figure is not None:
-        from fcslam.lab.evaluation.charts import fleet_charts
-        from fcslam.lab.evaluation.fleet_figure import write_figure
-
-        with ProgressDisplay(notices()) as display:
-            display.start("drawing")
-            write_figure(fleet_charts(run, truth), figure)
 
 
 @app.command()

@@ -1,23 +1,23 @@
 """Charts of a run and its ground truth: every robot's own map, the fused map, the building, and matched places."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from fcslam.errors import EvaluationError
-from fcslam.lab.evaluation.fleet_figure import IDENTITY, Chart, FleetCharts, MatchedPlaces, Outline
 from fcslam.lab.evaluation.ground_truth import TRUE_MAP, KnownPoses, known_poses, read_grid, truth_folder
 from fcslam.metrics.trajectory import align
 from fcslam.records import ClosureStatus, FloatArray
 from fcslam.runs import LOCAL, ClosureRow, LocalMap, Run, open_run
 
+from .fleet_figure import IDENTITY, Chart, FleetCharts, MatchedPlaces
 
-def fleet_charts(run: Path, truth: Path | None = None, outlines: Sequence[Outline] = ()) -> FleetCharts:
+
+def fleet_charts(run: Path, truth: Path | None = None) -> FleetCharts:
     """Make the charts of a run folder and its ground truth.
 
-    Without ``truth`` it searches for the truth like ``evaluate_fleet``; ``outlines`` are walls and furniture of the
-    building, in its coordinate frame.
+    Without ``truth`` it searches for the truth like ``evaluate_fleet``.
 
     Raises:
         EvaluationError: the run has no maps of single robots, or the truth of a robot or the true map is missing.
@@ -35,7 +35,6 @@ def fleet_charts(run: Path, truth: Path | None = None, outlines: Sequence[Outlin
         building=Chart(
             read_grid(folder / TRUE_MAP),
             {robot: known.truth.T_map_base[known.truth.robots == k] for k, robot in enumerate(opened.local_maps)},
-            outlines=outlines,
         ),
         matches=_matches(opened),
     )

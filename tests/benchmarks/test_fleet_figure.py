@@ -6,23 +6,21 @@ from itertools import combinations
 import cv2
 import numpy as np
 import pytest
-
-from fcslam.cli import main
-from fcslam.errors import EvaluationError, OutputError
-from fcslam.geometry import se2
-from fcslam.lab.evaluation.charts import fleet_charts
-from fcslam.lab.evaluation.fleet_figure import (
+from evaluation.fleet_charts import fleet_charts
+from evaluation.fleet_figure import (
     MATCHES_DRAWN,
     RAY_M,
     WIDTH_PX,
     Chart,
     FleetCharts,
     MatchedPlaces,
-    Outline,
     draw_figure,
     spread,
     write_figure,
 )
+
+from fcslam.errors import EvaluationError, OutputError
+from fcslam.geometry import se2
 from fcslam.maps import palette
 from fcslam.metrics.grid import LabelledGrid
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
@@ -55,11 +53,10 @@ def match(i, j, channel=Channel.LIDAR, x=1.0, accepted=True):
 @pytest.fixture
 def charts():
     trajectories = {robot: way(k) for k, robot in enumerate(ROBOTS)}
-    cabinet = Outline(np.array(((2, 2), (3, 2), (3, 3), (2, 3))), True)
     return FleetCharts(
         {robot: Chart(hall(), {robot: way()}) for robot in ROBOTS},
         Chart(hall(), trajectories, (1.0, 2.0, 0.7)),
-        Chart(hall(), trajectories, outlines=(cabinet,)),
+        Chart(hall(), trajectories),
         [match(0, 1), match(1, 2), match(0, 2), match(0, 1, Channel.CAMERA)],
     )
 
@@ -109,12 +106,6 @@ def test_charts_stay_on_the_sheet_and_apart(charts):
         assert high[0] < WIDTH_PX
         assert high[1] < axes.get_ylim()[1]
         assert all((high < other).any() or (low > beyond).any() for other, beyond in boxes[:k])
-
-
-def test_what_stands_in_the_building_is_drawn(charts):
-    axes = sheet(charts)
-    (cabinet,) = axes.patches
-    np.testing.assert_allclose(cabinet.get_xy()[0], pixel(axes, 4, 2, 2))
 
 
 def test_a_line_leads_from_place_to_place_in_the_color_of_its_channel(charts):
@@ -265,11 +256,3 @@ def test_what_is_missing_is_told(run_folder):
     (run_folder / "local").rmdir()
     with pytest.raises(EvaluationError, match="robots' own maps"):
         fleet_charts(run_folder)
-
-
-def test_the_command_draws_it(run_folder):
-    drawn = run_folder.parent / "figure.png"
-    assert main(["evaluate", "fleet", str(run_folder), "--figure", str(drawn)]) == 0
-    picture = cv2.imread(str(drawn))
-    assert picture is not None
-    assert picture.shape[1] == WIDTH_PX

@@ -16,7 +16,7 @@ from scipy.ndimage import binary_dilation, binary_opening
 from fcslam.errors import writing
 from fcslam.geometry import se2
 from fcslam.maps.drawing import round_length
-from fcslam.maps.palette import CLOSURES, FLOOR, FURNITURE, INK, PAPER, WALL, robot_colors
+from fcslam.maps.palette import CLOSURES, FLOOR, INK, PAPER, WALL, robot_colors
 from fcslam.metrics.grid import LabelledGrid
 from fcslam.records import Channel, FloatArray
 
@@ -62,14 +62,6 @@ class MatchedPlaces(NamedTuple):
     """Whether the joint map uses it."""
 
 
-class Outline(NamedTuple):
-    """A wall or a piece of furniture."""
-
-    corners: FloatArray
-    """Shape (K, 2), metres in the chart's map."""
-    furniture: bool
-
-
 @dataclass(frozen=True, slots=True)
 class Chart:
     """A map and the trajectories of robots in it."""
@@ -79,22 +71,16 @@ class Chart:
     """Each robot's poses or points in the map's coordinate frame, shape (N, 2+)."""
     T_chart_map: tuple[float, float, float] = IDENTITY
     """Pose of the map on the chart: x, y in metres, theta in radians."""
-    outlines: Sequence[Outline] = ()
 
     def place(self, points: FloatArray) -> FloatArray:
         """Transform points (N, 2+) of the map to the chart, metres, shape (N, 2)."""
         return np.asarray(se2.transform(self.T_chart_map, np.asarray(points, dtype=np.float64)[:, :2]))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower left and upper right corner (2,), metres on the chart, of known area, trajectories and outlines."""
+        """Lower left and upper right corner (2,), metres on the chart, of known area and trajectories."""
         side = max(1, round(RAY_M / self.grid.resolution_m))
         known = binary_opening(self.grid.free | self.grid.occupied, np.ones((side, side), np.bool_))
-        points = [
-            self.grid.centres(known),
-            *self.trajectories.values(),
-            *(outline.corners for outline in self.outlines),
-        ]
-        placed = np.concatenate([self.place(part) for part in points])
+        placed = np.concatenate([self.place(part) for part in (self.grid.centres(known), *self.trajectories.values())])
         if not len(placed):
             return np.zeros(2), np.ones(2)
         return placed.min(axis=0) - RAY_M, placed.max(axis=0) + RAY_M
@@ -243,10 +229,8 @@ def _sheet(height_px: float) -> "tuple[Figure, Axes]":
 
 
 def _draw_chart(axes: "Axes", panel: _Panel, colors: Mapping[str, str]) -> None:
-    """Draw the map, the outlines, and every trajectory with a dot at its start."""
+    """Draw the map, and every trajectory with a dot at its start."""
     _draw_grid(axes, panel)
-    for corners, furniture in panel.chart.outlines:
-        axes.fill(*panel.pixels(corners).T, color=_hex(FURNITURE if furniture else WALL), linewidth=0)
     lines = [(panel.pixels(poses), colors[robot]) for robot, poses in panel.chart.trajectories.items()]
     for pixels, color in lines:
         axes.plot(*pixels.T, color=_hex(FLOOR), linewidth=2.2)
