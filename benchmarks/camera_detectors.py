@@ -99,7 +99,7 @@ def settings(weights: Sequence[Path], folder: Path) -> dict[str, Path]:
     views = {ORB: "detector: orb"}
     for path in weights:
         version = OnnxDetector(OnnxConfig(weights=path)).version
-        views[version] = f"detector: onnx, onnx: {{weights: '{path.resolve()}'}}"
+        views[version] = f"detector: onnx, weights: '{path.resolve()}'"
     for name, view in views.items():
         text = f"robot: {{channels: [camera], views: {{{view}}}}}\n"
         (folder / f"{name}.yaml").write_text(text, encoding="utf-8")

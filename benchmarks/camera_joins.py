@@ -73,7 +73,7 @@ def main() -> None:
 def mapped(name: str, network: Path, seed: int, fleets: Path) -> list[tuple]:
     """One building with one network."""
     folder, watch = recorded(seed, len(ROBOTS), fleets), JoinWatch()
-    views = ViewsConfig(onnx=OnnxConfig(weights=network))
+    views = ViewsConfig(weights=network)
     config = MissionConfig(robot=RobotConfig(channels=(Channel.CAMERA,), views=views))
     run = run_mission([open_source(folder / robot, name=robot) for robot in ROBOTS], config, live=watch)
     paths = {robot: path_m(run.local_maps[robot].T_local_base) for robot in ROBOTS}

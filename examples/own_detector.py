@@ -2,7 +2,7 @@
 
     python examples/own_detector.py [FILE.onnx]
 
-To map with it, set `robot.views.onnx.weights` to the file. This one knows contrast and random filters.
+To map with it, set `robot.views.weights` to the file. This one knows contrast and random filters.
 """
 
 import sys

@@ -14,7 +14,6 @@ from evaluation import map_search
 from scipy.ndimage import binary_dilation
 
 from fcslam.config import load as load_config
-from fcslam.features.classical import OrbConfig
 from fcslam.geometry import se2
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import Channel
@@ -172,5 +171,4 @@ def test_each_detector_alone_describes_the_camera_places(camera_detectors, tmp_p
     robots = [load_config(MissionConfig, file).robot for file in files.values()]
     assert {robot.channels for robot in robots} == {(Channel.CAMERA,)}
     assert [str(robot.views.detector) for robot in robots] == ["orb", "onnx", "onnx"]
-    assert [robot.views.onnx.weights for robot in robots] == [None, *paths]
-    assert robots[0].views.orb == OrbConfig()
+    assert [robot.views.weights for robot in robots] == [None, *paths]

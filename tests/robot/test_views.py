@@ -131,7 +131,7 @@ def test_channels_are_a_choice(seen):
 def test_a_network_describes_places_in_its_own_version(seen, tmp_path):
     pytest.importorskip("onnxruntime")
     tiny_network(tmp_path / "n.onnx", version="tiny-7")
-    (tmp_path / "robot.yaml").write_text(f"views: {{detector: onnx, onnx: {{weights: {tmp_path}/n.onnx}}}}")
+    (tmp_path / "robot.yaml").write_text(f"views: {{detector: onnx, weights: {tmp_path}/n.onnx}}")
     config = load(RobotConfig, tmp_path / "robot.yaml")
     (tmp_path / "dumped.yaml").write_text(dump(config))
     assert load(RobotConfig, tmp_path / "dumped.yaml") == config
@@ -144,7 +144,7 @@ def test_a_network_describes_places_in_its_own_version(seen, tmp_path):
 
 def test_a_network_that_is_missing_is_told_at_once(tmp_path):
     pytest.importorskip("onnxruntime")
-    views = ViewsConfig(detector=DetectorKind.ONNX, onnx=OnnxConfig(weights=tmp_path / "missing.onnx"))
+    views = ViewsConfig(detector=DetectorKind.ONNX, weights=tmp_path / "missing.onnx")
     with pytest.raises(FeatureError, match="cannot read the network weights"):
         RobotFrontend("r", RobotConfig(views=views))
 

@@ -1,14 +1,13 @@
 """OpenCV's ORB, and the choice between it and the network: its descriptors are binary too."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.features.detector import (
     NO_FEATURES,
     FeatureDetector,
@@ -30,18 +29,14 @@ PYRAMID_LEVELS = 8
 """Levels of ORB's image pyramid, each 1.2 times coarser than the one before."""
 
 
-class OrbConfig(Settings):
+@dataclass(frozen=True, slots=True)
+class OrbConfig:
     """The ORB detector. Places from different settings cannot be compared."""
 
-    most_features: int = Field(
-        default=300, ge=1, le=2000, description="most ORB features of an image, the strongest first"
-    )
-    fast_threshold: int = Field(
-        default=7,
-        ge=1,
-        le=100,
-        description="smallest contrast of a FAST corner, low for dim light [grey levels of 255]",
-    )
+    most_features: int = 300
+    """Most features of an image, the strongest first."""
+    fast_threshold: int = 7
+    """Smallest contrast of a FAST corner, in grey levels of 255; low for dim light."""
 
 
 class Orb:

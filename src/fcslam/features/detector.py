@@ -12,14 +12,12 @@ import os
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Final, Protocol, Self
+from typing import Any, Final, Protocol, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.errors import FeatureError
 from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX, Logits, Probabilities, find_peaks, sample_logits
@@ -101,27 +99,22 @@ def network_file(weights: Path | None) -> Path:
     return bundled if weights == Path(weights.name) and bundled.is_file() else weights
 
 
-class OnnxConfig(Settings):
+@dataclass(frozen=True, slots=True)
+class OnnxConfig:
     """The network detector. Places from different weights cannot be compared."""
 
-    weights: Path | None = Field(
-        default=None,
-        description="ONNX file with the network weights; null: the bundled network; vgg: the paper's, also bundled",
-    )
-    most_features: int = Field(
-        default=300, ge=1, le=2000, description="most network features of an image, the strongest first"
-    )
-    nms_px: float = Field(
-        default=4.0, ge=0.0, le=64.0, description="side of the boxes of non-maximum suppression around keypoints [px]"
-    )
-    scales: tuple[Annotated[float, Field(gt=0.0, le=1.0)], ...] = Field(
-        default=(1.0,),
-        min_length=1,
-        max_length=8,
-        description="scales of the image pyramid; the strongest keypoints of all scales together are kept",
-    )
-    least_score: float = Field(default=0.005, ge=0.0, lt=1.0, description="smallest probability of a keypoint")
-    threads: int = Field(default=1, ge=1, le=64, description="CPU threads of the network")
+    weights: Path | None = None
+    """ONNX file with the network weights; None: the bundled network; vgg: the paper's, also bundled."""
+    most_features: int = 300
+    """Most features of an image, the strongest first."""
+    nms_px: float = 4.0
+    """Side of the boxes of non-maximum suppression around keypoints."""
+    scales: tuple[float, ...] = (1.0,)
+    """Scales of the image pyramid; the strongest keypoints of all scales together are kept."""
+    least_score: float = 0.005
+    """Smallest probability of a keypoint."""
+    threads: int = 1
+    """CPU threads of the network."""
 
 
 class OnnxDetector:

@@ -23,7 +23,7 @@ def describe_detector_file(path: Path) -> DetectorFile:
     return DetectorFile(Channel.CAMERA, version, int(NETWORK_FORMAT), len(content), digest)
 
 
-def open_detector_file(file: DetectorFile, path: Path, config: OnnxConfig) -> FeatureDetector:
+def open_detector_file(file: DetectorFile, path: Path) -> FeatureDetector:
     """Load a downloaded network after a check against its announcement ``file``.
 
     Raises:
@@ -35,7 +35,7 @@ def open_detector_file(file: DetectorFile, path: Path, config: OnnxConfig) -> Fe
     if len(content) != file.size or hashlib.sha256(content).digest() != file.sha256:
         raise FeatureError(f"{path}: is not the file that was announced as {file.version}; fetch it again")
     check_network(path)
-    detector = OnnxDetector(config.model_copy(update={"weights": path}))
+    detector = OnnxDetector(OnnxConfig(weights=path))
     if detector.version != file.version:
         raise FeatureError(f"{path}: holds detector {detector.version}, but was announced as {file.version}")
     return detector

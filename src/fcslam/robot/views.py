@@ -35,8 +35,11 @@ class ViewsConfig(Settings):
     detector: DetectorKind = Field(
         default=DetectorKind.ONNX, description="detector of camera images: onnx (a network) or orb"
     )
-    orb: OrbConfig = Field(default=OrbConfig(), description="settings of the detector orb")
-    onnx: OnnxConfig = Field(default=OnnxConfig(), description="settings of the detector onnx")
+    weights: Path | None = Field(
+        default=None,
+        description="ONNX file with the weights of the network; null: the bundled network; vgg: the paper's, also "
+        "bundled",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +59,7 @@ class ViewExtractor:
 
     def __init__(self, config: ViewsConfig, folder: KeyframeFolder | None = None) -> None:
         """Load the detector; ``folder`` keeps the keyframes that are in the image buffer."""
-        self._config = config
-        self._detector = make_detector(config.detector, config.orb, config.onnx)
+        self._detector = make_detector(config.detector, OrbConfig(), OnnxConfig(weights=config.weights))
         self._image_buffer = ImageBuffer()
         self._folder = folder
         self._last: tuple[int, FloatArray] | None = None
@@ -111,7 +113,7 @@ class ViewExtractor:
 
     def set_detector(self, file: DetectorFile, path: Path) -> None:
         """Use a downloaded network from now on."""
-        self._detector = open_detector_file(file, path, self._config.onnx)
+        self._detector = open_detector_file(file, path)
 
     def reset(self) -> None:
         """Start a new session: forget all images."""
