@@ -29,7 +29,7 @@ def record(
         str,
         typer.Argument(
             metavar="ADDRESS|LOG",
-            help="A live robot: ros2:/NAMESPACE or zenoh:/NAMESPACE; ros2:/ has none. Or a recording, to write it in "
+            help="A live robot: ros2:/NAMESPACE or zenoh:/NAMESPACE; ros2:/ has none. Or a recording, to write it "
             "as a bag.",
         ),
     ],
