@@ -12,6 +12,7 @@ from fcslam.cloud.settings import FleetConfig
 from fcslam.places.matcher import MatcherConfig
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Veto
+from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import read_state, write_state
 from tests import small_fleet
 from tests.small_fleet import fingerprint, in_order
@@ -85,11 +86,11 @@ def test_a_log_survives_with_its_gaps_and_refusals(tmp_path):
         log.add(PacketNumber("a", sequence), float(sequence))
     log.refuse(PacketNumber("a", 2))
     assert [number.sequence for number in log.ready("a")] == [0, 1, 3, 4]
-    write_state(tmp_path / "log", "test", log.state())
-    again = PacketLog.restored(read_state(tmp_path / "log", "test"))
+    write_state(tmp_path / "log", "test", to_state(log))
+    again = from_state(PacketLog, read_state(tmp_path / "log", "test"))
     for each in (log, again):
         each.add(PacketNumber("a", 5), 9.0)
         each.add(PacketNumber("a", 6), 8.0)
     assert list(again.ready("a")) == list(log.ready("a")) == [PacketNumber("a", n) for n in (5, 6, 7)]
-    assert again.state() == log.state()
+    assert to_state(again) == to_state(log)
     assert PacketNumber("a", 2) in again

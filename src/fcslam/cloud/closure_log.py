@@ -1,11 +1,8 @@
 """The log of all closures that were considered, with their status and its reason."""
 
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 
-import numpy as np
-
-from fcslam.cloud.edits import edit_json, read_edit
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
     Channel,
@@ -18,9 +15,9 @@ from fcslam.records import (
     Reason,
     ReasonCode,
     Tag,
-    TagFamily,
     frozen,
 )
+from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import State
 
 MATCHER = "fleet.matcher"
@@ -134,53 +131,12 @@ class ClosureLog:
 
     def state(self) -> State:
         """The state that ``restore`` needs."""
-        closures = [entry.closure for entry in self._entries]
-        tags = [(row, *closure.tag) for row, closure in enumerate(closures) if closure.tag is not None]
-        return {
-            **({"tags": tags} if tags else {}),
-            "T_i_j": np.array([closure.T_i_j for closure in closures]).reshape(-1, 3),
-            "information": np.array([closure.information for closure in closures]).reshape(-1, 3, 3),
-            "facts": [
-                (
-                    c.i,
-                    c.j,
-                    c.channel,
-                    c.similarity,
-                    c.status,
-                    astuple(c.reason),
-                    c.informative,
-                    entry.independent,
-                    entry.edge,
-                    entry.vetoed,
-                    entry.pinned,
-                    entry.made_by_hand and edit_json(entry.made_by_hand),
-                )
-                for entry, c in zip(self._entries, closures, strict=True)
-            ],
-        }
+        return {"entries": to_state(self._entries)}
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
-        rows = zip(state["facts"], frozen(state["T_i_j"]), frozen(state["information"]), strict=True)
-        tags = {row: Tag(TagFamily(family), number) for row, family, number in state.get("tags", ())}
-        for row, (fact, T_i_j, information) in enumerate(rows):
-            i, j, channel, similarity, status, reason, informative, *entry, by_hand = fact
-            code, *details = reason
-            closure = LoopClosure(
-                KeyscanId(*i),
-                KeyscanId(*j),
-                Channel(channel),
-                similarity,
-                T_i_j,
-                information,
-                ClosureStatus(status),
-                Reason(ReasonCode(code), *details),
-                informative,
-                tags.get(row),
-            )
-            restored = self._add(ClosureEntry(closure, *entry))
-            if by_hand is not None and isinstance(edit := read_edit("closure", by_hand), ManualClosure):
-                restored.made_by_hand = edit
+        for entry in from_state(list[ClosureEntry], state["entries"]):
+            self._add(entry)
 
     def evidence(self, a: str, b: str) -> list[ClosureEntry]:
         """The verified closures between two robots that the joint map did not predict and no veto excludes."""

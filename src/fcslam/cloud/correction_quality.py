@@ -9,6 +9,7 @@ from fcslam.cloud.closure_log import ClosureLog
 from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD, JointGraph
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import KeyscanId, Place
+from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import State
 
 FRESH_M = 4.0
@@ -54,11 +55,11 @@ class CorrectionQuality:
 
     def state(self) -> State:
         """The state that ``restore`` takes."""
-        return {"newest": {session: tuple(comparison) for session, comparison in self._newest.items()}}
+        return {"newest": to_state(self._newest)}
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
-        self._newest = {session: _Comparison(*comparison) for session, comparison in state["newest"].items()}
+        self._newest = from_state(dict[str, _Comparison], state["newest"])
 
     def of(self, session: str, robots: Collection[str], closures: ClosureLog) -> float:
         """In [0, 1], as in ``Correction``; ``robots`` share the session's map."""

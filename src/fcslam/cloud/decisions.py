@@ -4,7 +4,6 @@
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, replace
 from functools import partial
 from itertools import combinations
 
@@ -22,7 +21,7 @@ from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.graph.cluster import ClusterDecision
-from fcslam.graph.evidence import ClusterEvidence, MapFit
+from fcslam.graph.evidence import ClusterEvidence
 from fcslam.lidar.scan import keyscan_points
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
@@ -39,6 +38,7 @@ from fcslam.records import (
     Undo,
     Veto,
 )
+from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import State
 
 CONTESTED_GROWTH = 1.1
@@ -168,10 +168,10 @@ class ClosureDecisions:
         """The state that ``restore`` needs."""
         return {
             "closures": self.closures.state(),
-            "due": [(sorted(pair), size) for pair, size in self._due.items()],
+            "due": to_state(self._due),
             "comparison": self._comparison.state(),
             "maps": self.maps,
-            "joins": [(sorted(pair), astuple(evidence)) for pair, evidence in self.joins.items()],
+            "joins": to_state(self.joins),
             "version": self.version,
             "changes": [(kind_of(change), edit_json(change)) for change in self._changes],
             "contested": self._contested,
@@ -181,11 +181,10 @@ class ClosureDecisions:
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
         self.closures.restore(state["closures"])
-        self._due = {frozenset(pair): size for pair, size in state["due"]}
+        self._due = from_state(dict[frozenset[str], int], state["due"])
         self._comparison.restore(state["comparison"])
         self.maps, self.version = state["maps"], state["version"]
-        for pair, (*counts, fit) in state["joins"]:
-            self.joins[frozenset(pair)] = replace(ClusterEvidence(*counts), fit=fit and MapFit(*fit))
+        self.joins = from_state(dict[frozenset[str], ClusterEvidence], state["joins"])
         changes = (read_edit(*change) for change in state["changes"])
         self._changes = tuple(change for change in changes if not isinstance(change, Undo))
         self._contested, self._postponed_until = state["contested"], state["postponed_until"]

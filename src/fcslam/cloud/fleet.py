@@ -153,7 +153,7 @@ class Fleet:
             "recognition": self._recognition.state(),
             "quality": self._quality.state(),
             "needs_replay": self._needs_replay,
-            **self._tags.state(),
+            "tags": self._tags.state(),
         }
 
     @classmethod
@@ -175,7 +175,7 @@ class Fleet:
         fleet._decisions.restore(state["decisions"])
         fleet._sessions.name_floors(floors(fleet._decisions.changes))
         fleet._recognition.restore(state["recognition"])
-        fleet._tags.restore(state)
+        fleet._tags.restore(state["tags"])
         fleet._quality.restore(state["quality"])
         fleet._needs_replay = state["needs_replay"]
         return fleet

@@ -17,6 +17,7 @@ from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.maps.fusion import fuse
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import ClosureStatus, Edit, FloatArray, frozen
+from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Packet
 
@@ -42,13 +43,13 @@ class FleetHost:
 
     def state(self) -> State:
         """The state after the packets so far, without these."""
-        return {"fleet": self.fleet.state(), "log": self.log.state()}
+        return {"fleet": self.fleet.state(), "log": to_state(self.log)}
 
     def restore(self, state: State, edits: Sequence[Edit] = ()) -> None:
         """Take over a state of the same configuration, which had followed ``edits``."""
         settings = self._settings
         fleet = Fleet.restored(settings.fleet, settings.seed, state["fleet"], self._read, self._verify_pairs)
-        self.fleet, self.log, self.edits = fleet, PacketLog.restored(state["log"]), tuple(edits)
+        self.fleet, self.log, self.edits = fleet, from_state(PacketLog, state["log"]), tuple(edits)
 
     def follow(self, edits: Sequence[Edit]) -> bool:
         """Follow further edits; True if the fleet is a new one, because the edits change what applied packets do."""

@@ -1,7 +1,7 @@
 """Comparison of the maps of two sessions: exhaustive around the places that match, or where a joint map lays them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from fcslam.lidar.map_agreement import LocalSubmap, Noise, PlaceAgreement, compa
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.records import FloatArray, Keyscan, KeyscanId, frozen
+from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import State
 
 REACH_M = 45.0
@@ -174,18 +175,11 @@ class MapComparison:
 
     def state(self) -> State:
         """The state that ``restore`` needs."""
-        rows = [
-            (c.i, c.j, c.T_i_j.tolist(), c.keyscans, c.closures, c.size, astuple(c.fit))
-            for each in self._compared.values()
-            for c in each
-        ]
-        return {"compared": rows}
+        return {"compared": to_state(self._compared)}
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
-        for i, j, T_i_j, keyscans, closures, size, fit in state["compared"]:
-            compared = _Compared(KeyscanId(*i), KeyscanId(*j), frozen(T_i_j), keyscans, closures, size, MapFit(*fit))
-            self._compared.setdefault(frozenset((compared.i.robot, compared.j.robot)), []).append(compared)
+        self._compared = from_state(dict[frozenset[str], list[_Compared]], state["compared"])
 
     def _map_around(self, session: str, poses: FloatArray, middle: FloatArray) -> _Near | None:
         """The session's map around a point (2,) in the frame of the poses (N, 3)."""

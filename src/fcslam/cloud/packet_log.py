@@ -6,9 +6,8 @@ keeps its sequence number, so later packets take effect without it.
 
 import math
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple, Self
-
-from fcslam.storage.state_file import State
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 
 class PacketNumber(NamedTuple):
@@ -18,18 +17,18 @@ class PacketNumber(NamedTuple):
     sequence: int
 
 
+@dataclass(slots=True, eq=False)
 class PacketLog:
     """Knows which packets arrived and which of them may take effect; the packets themselves are kept elsewhere."""
 
-    def __init__(self) -> None:
-        self._next: dict[str, int] = {}
-        """By session the number of the first packet that did not take effect."""
-        self._waiting: dict[str, set[int]] = {}
-        """By session the numbers that arrived and did not take effect."""
-        self._refused: set[PacketNumber] = set()
-        self._released = 0
-        self._newest = (-math.inf, "", 0)
-        self._is_canonical = True
+    _next: dict[str, int] = field(default_factory=dict)
+    """By session the number of the first packet that did not take effect."""
+    _waiting: dict[str, set[int]] = field(default_factory=dict)
+    """By session the numbers that arrived and did not take effect."""
+    _refused: set[PacketNumber] = field(default_factory=set)
+    _released: int = 0
+    _newest: tuple[float, str, int] = (-math.inf, "", 0)
+    _is_canonical: bool = True
 
     def __contains__(self, number: PacketNumber) -> bool:
         """Whether this packet arrived before or was refused."""
@@ -98,29 +97,6 @@ class PacketLog:
     def waiting_count(self, session: str) -> int:
         """How many packets of the session wait for one before them."""
         return len(self._waiting.get(session, ()))
-
-    def state(self) -> State:
-        """All that is known, for ``restored``."""
-        return {
-            "next": dict(self._next),
-            "waiting": {session: sorted(numbers) for session, numbers in self._waiting.items()},
-            "refused": sorted(self._refused),
-            "released": self._released,
-            "newest": self._newest,
-            "is_canonical": self._is_canonical,
-        }
-
-    @classmethod
-    def restored(cls, state: State) -> Self:
-        """The log of a ``state``."""
-        log = cls()
-        log._next = state["next"]
-        log._waiting = {session: set(numbers) for session, numbers in state["waiting"].items()}
-        log._refused = {PacketNumber(*number) for number in state["refused"]}
-        log._released, log._is_canonical = state["released"], state["is_canonical"]
-        time_s, session, sequence = state["newest"]
-        log._newest = time_s, session, sequence
-        return log
 
     def canonical(self, arrived: Iterable[tuple[float, PacketNumber]]) -> Iterator[PacketNumber]:
         """The packets that took effect, in the order that depends on the set of packets alone.

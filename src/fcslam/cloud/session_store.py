@@ -24,8 +24,8 @@ from fcslam.records import (
     LaserModel,
     MapTile,
     Place,
-    frozen,
 )
+from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Hello, Packet
 
@@ -299,21 +299,18 @@ class SessionStore:
         return _Session(
             hello=self._stored(PacketNumber(name, state["hello"]), Hello),
             hello_sequence=state["hello"],
-            announced={(Channel(channel), version) for channel, version in state["announced"]},
+            announced=from_state(set[tuple[Channel, str]], state["announced"]),
             keyscans=[
                 _KeptKeyscan(stamp, sequence, None, is_released, holders)
                 for stamp, sequence, is_released, holders in zip(*columns, strict=True)
             ],
             connected=state["connected"],
-            T_odom_base=frozen(state["T_odom_base"]) if "T_odom_base" in state else None,
-            places={(number, Channel(channel), version) for number, channel, version in state["places"]},
-            spans={(number, Channel(channel)): (first, last) for number, channel, first, last in state["spans"]},
+            T_odom_base=from_state(FloatArray | None, state["T_odom_base"]),
+            places=from_state(set[tuple[int, Channel, str]], state["places"]),
+            spans=from_state(dict[tuple[int, Channel], tuple[int, int]], state["spans"]),
             tiles={(tile.column, tile.row): tile for tile in tiles},
             tile_sequences=state["tiles"],
-            fixes={
-                int(number): KeyscanFix(KeyscanId(name, int(number)), latitude, longitude, altitude, sigma, (x, y))
-                for number, latitude, longitude, altitude, sigma, x, y in state["fixes"].tolist()
-            },
+            fixes=from_state(dict[int, KeyscanFix], state["fixes"]),
         )
 
     def _keyscan(self, robot: str, number: int) -> Keyscan | None:
@@ -345,13 +342,9 @@ class SessionStore:
 
 
 def _session_state(session: _Session) -> State:
-    fixes = [
-        (number, fix.latitude_deg, fix.longitude_deg, fix.altitude_m, fix.sigma_m, *fix.antenna_xy)
-        for number, fix in session.fixes.items()
-    ]
-    state: State = {
+    return {
         "hello": session.hello_sequence,
-        "announced": sorted(session.announced),
+        "announced": to_state(session.announced),
         "keyscans": {
             "stamps": np.array([kept.stamp for kept in session.keyscans]),
             "sequences": np.array([kept.sequence for kept in session.keyscans], np.int64),
@@ -359,9 +352,9 @@ def _session_state(session: _Session) -> State:
             "holders": np.array([kept.holders for kept in session.keyscans], np.int64),
         },
         "connected": session.connected,
-        "places": sorted(session.places),
-        "spans": [(*place, *span) for place, span in session.spans.items()],
+        "places": to_state(session.places),
+        "spans": to_state(session.spans),
         "tiles": session.tile_sequences.copy(),
-        "fixes": np.array(fixes).reshape(-1, 7),
+        "fixes": to_state(session.fixes),
+        "T_odom_base": to_state(session.T_odom_base),
     }
-    return state if session.T_odom_base is None else {**state, "T_odom_base": np.array(session.T_odom_base)}

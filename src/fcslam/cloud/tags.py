@@ -28,10 +28,10 @@ from fcslam.records import (
     Reason,
     ReasonCode,
     Tag,
-    TagFamily,
     TagSighting,
     frozen,
 )
+from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import State
 
 MOST_SENDERS = 10
@@ -106,31 +106,16 @@ class SeenTags:
         )
 
     def state(self) -> State:
-        """The state that ``restore`` needs; empty without sightings."""
-        rows = [one for sessions in self._seen.values() for own in sessions.values() for one in own.values()]
-        if not rows:
-            return {}
-        return {
-            "tags": [(*one.id, *one.tag) for one in rows],
-            "T_base_tag": np.array([one.T_base_tag for one in rows]),
-            "tag_information": np.array([one.information for one in rows]),
-            "tag_pairs": [(*tag, *one, name) for tag, pairs in self._paired.items() for one, name in sorted(pairs)],
-        }
+        """The state that ``restore`` needs."""
+        return {"seen": to_state(self._seen), "paired": to_state(self._paired)}
 
     def restore(self, state: State) -> None:
-        """Take over what ``state`` gave."""
-        if "tags" not in state:
-            return
-        rows = zip(state["tags"], frozen(state["T_base_tag"]), frozen(state["tag_information"]), strict=True)
-        for (session, keyscan, family, number), T_base_tag, information in rows:
-            tag = Tag(TagFamily(family), number)
-            sighting = TagSighting(KeyscanId(session, keyscan), tag, T_base_tag, information)
-            self._seen.setdefault(tag, {}).setdefault(session, {})[keyscan] = sighting
-            self._tags[sighting.id] += 1
-        for family, number, session, keyscan, name in state["tag_pairs"]:
-            pair = KeyscanId(session, keyscan), name
-            self._paired.setdefault(Tag(TagFamily(family), number), set()).add(pair)
-            self._ends[frozenset((session, name))] += 1
+        """Take over a ``state``."""
+        self._seen = from_state(dict[Tag, dict[str, dict[int, TagSighting]]], state["seen"])
+        self._paired = from_state(dict[Tag, set[tuple[KeyscanId, str]]], state["paired"])
+        every = [one for sessions in self._seen.values() for own in sessions.values() for one in own.values()]
+        self._tags = Counter(one.id for one in every)
+        self._ends = Counter(frozenset((one.robot, name)) for pairs in self._paired.values() for one, name in pairs)
 
     def _share_floor(self, a: str, b: str) -> bool:
         return self._sessions.floor(a) == self._sessions.floor(b)
