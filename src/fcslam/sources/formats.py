@@ -14,8 +14,7 @@ from fcslam.sources.bags.container import ZSTD, is_bag, parts_of
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag, as_fleet
 from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_errors
-from fcslam.sources.logs.carmen import CARMEN, RAW_CARMEN
-from fcslam.sources.logs.dialect import Dialect
+from fcslam.sources.logs.carmen import is_carmen
 from fcslam.sources.logs.textlog import TextLog
 from fcslam.sources.source import Source
 from fcslam.untrusted import open_file
@@ -49,15 +48,8 @@ class Format:
     """Opens a path with the robot's name, and options, which are for bags only."""
 
 
-def _text_format(dialect: Dialect) -> Format:
-    def recognises(_: Path, head: bytes) -> bool:
-        return bool(dialect.recognises(head))
-
-    return Format(dialect.name, recognises, lambda path, name, _: TextLog(path, name, dialect))
-
-
 FORMATS: tuple[Format, ...] = (
-    *map(_text_format, (RAW_CARMEN, CARMEN)),
+    Format("CARMEN log", is_carmen, lambda path, name, _: TextLog(path, name)),
     Format(_BAG, is_bag, RosBag),
 )
 """Tried in this order. To add a format, add an entry."""

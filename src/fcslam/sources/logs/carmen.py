@@ -17,25 +17,19 @@ TRUEPOS ...) are passed over; a line that starts with no message name is broken.
 
 import re
 from collections.abc import Callable
-from math import nan
+from math import isfinite, nan
+from pathlib import Path
+from typing import NamedTuple
 
 from fcslam.geometry.beams import is_field_of_view
 from fcslam.records import Beams
-from fcslam.sources.logs.dialect import (
-    Dialect,
-    Line,
-    OdometryLine,
-    ParameterLine,
-    ScanLine,
-    StatedLaser,
-    check_beams,
-    has_beams,
-    pose_of,
-    stamp_of,
-    with_points,
-)
-from fcslam.sources.logs.laser import SICK_MAX_RANGE_M
 from fcslam.sources.pose import Pose
+
+SICK_MAX_RANGE_M = 50.0
+"""SICK scanners send it, or more, for no return."""
+_MAX_COORDINATE = 1e7
+"""Metres or radians; a larger pose is damage."""
+_NUMBER_LETTERS = b"0123456789.+-eEinfatyINFATY \t"
 
 _RAW, _SCAN = (
     re.compile(rb"^[ \t]*(" + name + rb")\s", re.MULTILINE) for name in (rb"RAWLASER1", rb"FLASER|ROBOTLASER1")
@@ -49,10 +43,60 @@ _KNOWN = re.compile(
 )
 
 
-class _CarmenParser:
-    """Holds the latest odometry."""
+class StatedLaser(NamedTuple):
+    """Laser geometry that a scan line states; radians and metres."""
 
-    def __init__(self, raw: bool = False) -> None:
+    angle_min_rad: float
+    angle_increment_rad: float
+    max_range_m: float
+
+
+class ScanLine(NamedTuple):
+    """One scan, its ranges as text."""
+
+    stamp: float
+    """Seconds; NaN if the log states none."""
+    T_odom_base: Pose
+    T_odom_laser: Pose
+    beam_count: int
+    range_text: bytes
+    stated: StatedLaser | None = None
+    is_timed: bool = True
+    """False once a stamp stands where the log states none."""
+
+
+class OdometryLine(NamedTuple):
+    """One reading of the odometry."""
+
+    stamp: float
+    """As in ``ScanLine``."""
+    T_odom_base: Pose
+
+
+class ParameterLine(NamedTuple):
+    """A setting of the robot that made the log."""
+
+    name: str
+    value: str
+
+
+Line = ScanLine | OdometryLine | ParameterLine
+
+
+def is_carmen(_: Path, head: bytes) -> bool:
+    """Whether the first bytes of a file are those of a CARMEN log."""
+    return bool(_KNOWN.search(head))
+
+
+def is_raw(head: bytes) -> bool:
+    """Whether the log has raw scans only."""
+    return bool(_RAW.search(head) and not _SCAN.search(head))
+
+
+class CarmenParser:
+    """Parses the lines of one pass over a log; holds the latest odometry."""
+
+    def __init__(self, raw: bool) -> None:
         """``raw``: scans are RAWLASER1 only."""
         self._T_odom_base: Pose | None = None
         self._parsers: dict[bytes, Callable[[bytes], Line]] = {
@@ -64,44 +108,45 @@ class _CarmenParser:
         }
 
     def __call__(self, line: bytes) -> Line | None:
+        """The message of a line, its ranges as text; None if it is not used. Raises ValueError for a broken line."""
         message = _MESSAGE.match(line)
         if message is None:
             raise ValueError("no CARMEN message")
         parser = self._parsers.get(message[1])
-        return parser(with_points(line)) if parser else None
+        return parser(line.replace(b",", b".")) if parser else None  # some languages write decimal commas
 
     def _rawlaser(self, line: bytes) -> ScanLine:
         front, *tail = line.rsplit(None, 3)
         measured = _measured(front)
         if self._T_odom_base is None:
             raise ValueError("no odometry before the scan")
-        return ScanLine(stamp_of(tail[0]), self._T_odom_base, self._T_odom_base, *measured)
+        return ScanLine(_stamp_of(tail[0]), self._T_odom_base, self._T_odom_base, *measured)
 
     def _odometry(self, line: bytes) -> OdometryLine:
         words = line.split()
         if len(words) < 7:
             raise ValueError("too few words")
-        self._T_odom_base = pose_of(words[1:4])
-        return OdometryLine(stamp_of(words[7]) if len(words) >= 10 else nan, self._T_odom_base)
+        self._T_odom_base = _pose_of(words[1:4])
+        return OdometryLine(_stamp_of(words[7]) if len(words) >= 10 else nan, self._T_odom_base)
 
 
 def _parse_flaser(line: bytes) -> ScanLine:
     front, *tail = line.rsplit(None, 9)
     _, count, range_text = front.split(None, 2)
     beam_count = int(count)
-    is_timed = has_beams(range_text, beam_count)
+    is_timed = _has_beams(range_text, beam_count)
     if not is_timed:
         front, *tail = line.rsplit(None, 6)
         _, _, range_text = front.split(None, 2)
-    check_beams(range_text, beam_count)
-    stamp = stamp_of(tail[6]) if is_timed else nan
-    return ScanLine(stamp, pose_of(tail[3:6]), pose_of(tail[:3]), beam_count, range_text)
+    _check_beams(range_text, beam_count)
+    stamp = _stamp_of(tail[6]) if is_timed else nan
+    return ScanLine(stamp, _pose_of(tail[3:6]), _pose_of(tail[:3]), beam_count, range_text)
 
 
 def _parse_robotlaser(line: bytes) -> ScanLine:
     front, *tail = line.rsplit(None, 14)
     measured = _measured(front)
-    return ScanLine(stamp_of(tail[11]), pose_of(tail[3:6]), pose_of(tail[:3]), *measured)
+    return ScanLine(_stamp_of(tail[11]), _pose_of(tail[3:6]), _pose_of(tail[:3]), *measured)
 
 
 def _measured(front: bytes) -> tuple[int, bytes, StatedLaser]:
@@ -109,7 +154,7 @@ def _measured(front: bytes) -> tuple[int, bytes, StatedLaser]:
     _, kind, start, fov, resolution, max_range, _, _, count, body = front.split(None, 9)
     beam_count = int(count)
     range_text = _without_remissions(body, beam_count)
-    check_beams(range_text, beam_count)
+    _check_beams(range_text, beam_count)
     numbers = [float(token) for token in (start, fov, resolution, max_range)]
     return beam_count, range_text, _stated_laser(int(kind), numbers, beam_count)
 
@@ -140,9 +185,31 @@ def _parse_parameter(line: bytes) -> ParameterLine:
     return ParameterLine(name, value)
 
 
-CARMEN = Dialect("CARMEN log", _KNOWN.search, _CarmenParser)
-RAW_CARMEN = Dialect(
-    "CARMEN log of raw scans",
-    lambda head: _RAW.search(head) and not _SCAN.search(head),
-    lambda: _CarmenParser(raw=True),
-)
+def _pose_of(tokens: list[bytes]) -> Pose:
+    """Raises ValueError for an implausible pose."""
+    x, y, theta = map(float, tokens)
+    limit = _MAX_COORDINATE
+    if not (-limit < x < limit and -limit < y < limit and -limit < theta < limit):
+        raise ValueError("no sane pose")
+    return x, y, theta
+
+
+def _stamp_of(token: bytes) -> float:
+    """Raises ValueError if it is not finite."""
+    stamp = float(token)
+    if not isfinite(stamp):
+        raise ValueError("no finite stamp")
+    return stamp
+
+
+def _check_beams(range_text: bytes, beam_count: int) -> None:
+    """Raise ValueError unless ``range_text`` has ``beam_count`` numbers, at least two, by count and characters."""
+    if beam_count < 2 or not _has_beams(range_text, beam_count):
+        raise ValueError("not as many ranges as stated")
+    if range_text.translate(None, _NUMBER_LETTERS):
+        raise ValueError("a range is not a number")
+
+
+def _has_beams(range_text: bytes, beam_count: int) -> bool:
+    """Whether a text has ``beam_count`` words, which most often are separated by single spaces."""
+    return range_text.count(b" ") + 1 == beam_count or len(range_text.split()) == beam_count

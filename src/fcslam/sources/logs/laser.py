@@ -24,10 +24,9 @@ from typing import NamedTuple
 
 from fcslam.records import Beams, LaserModel
 from fcslam.sources.gate import TOLERATED_SHARE, usual_beams
-from fcslam.sources.logs.dialect import ScanLine, StatedLaser
+from fcslam.sources.logs.carmen import SICK_MAX_RANGE_M, ScanLine, StatedLaser
 from fcslam.sources.pose import Pose, relative_pose
 
-SICK_MAX_RANGE_M = 50.0
 FEWEST_INTERLEAVED = 2
 """Least number of scans with each of two counts, among the first ones, of a scanner that interleaves."""
 

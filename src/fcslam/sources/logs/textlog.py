@@ -1,8 +1,8 @@
-"""Reads a text log: surveys it once, then streams its records.
+"""Reads a CARMEN log: surveys it once, then streams its records.
 
 Besides the rules of ``gate``:
 
-- Scans of a dialect without stamps get stamps 1 s apart, and are counted.
+- Scans without stamps get stamps 1 s apart, and are counted.
 - If only the poses of odometry messages change, a scan takes the pose of the message before it.
 - Poses that say nothing (``PathSummary.fault``) are not odometry.
 """
@@ -11,9 +11,11 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cached_property
-from math import isnan
+from math import isnan, nan
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
@@ -21,10 +23,17 @@ from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, R
 from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, check_consistency, scan_window
-from fcslam.sources.logs.archive import numbered_lines
-from fcslam.sources.logs.dialect import Dialect, Line, OdometryLine, ParameterLine, ScanLine
-from fcslam.sources.logs.laser import (
+from fcslam.sources.logs.archive import head, numbered_lines
+from fcslam.sources.logs.carmen import (
     SICK_MAX_RANGE_M,
+    CarmenParser,
+    Line,
+    OdometryLine,
+    ParameterLine,
+    ScanLine,
+    is_raw,
+)
+from fcslam.sources.logs.laser import (
     Interleaving,
     LogBeams,
     MountingEstimate,
@@ -32,7 +41,6 @@ from fcslam.sources.logs.laser import (
     laser_model,
     tells_more,
 )
-from fcslam.sources.logs.ranges import NumberedLine, parse_ahead, parse_ranges
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary, check_units
 from fcslam.sources.pose import UNKNOWN_POSE, Pose
 from fcslam.sources.returns import RangeSample, placeholder_note, without
@@ -42,7 +50,10 @@ KEPT_BYTES = 1 << 25
 """A log with more bytes is decompressed and parsed again in each pass, so that memory does not grow with its length."""
 
 
+NumberedLine = tuple[int, Line | None]
+"""A line with its number, counted from 1; None if it is broken."""
 _WORDS_NAMED, _LONGEST_WORD = 5, 20
+_LONGEST_RANGE_M = 1e6
 UNTIMED_STEP_S = 1.0
 """Time between the scans of a log that states none."""
 FULL_TURN_RAD = 6.0
@@ -76,10 +87,9 @@ class _Scan(NamedTuple):
 class TextLog:
     """A log with one message per line, compressed or not."""
 
-    def __init__(self, path: Path, name: str, dialect: Dialect) -> None:
+    def __init__(self, path: Path, name: str) -> None:
         self.name = name
         self._path = path
-        self._dialect = dialect
         self._audit = Audit()
         self._kept: list[NumberedLine] = []
         """All lines, once a short log was read to its end and until all its records were."""
@@ -104,8 +114,7 @@ class TextLog:
         audit = self._audit = Audit()
         watch = ScanWatch(audit)
         (laser,) = self._reading.survey.lasers
-        unit = self._dialect.metres_per_range_unit
-        for number, entry in self._entries(scans, parse_ahead(self._all_lines(), unit), audit):
+        for number, entry in self._entries(scans, self._all_lines(), audit):
             T_odom_base: FloatArray = frozen(entry.T_odom_base)
             if isinstance(entry, OdometryLine):
                 if self._reading.has_odometry:
@@ -114,7 +123,7 @@ class TextLog:
             model = laser.with_beams(entry.beams)
             ranges_m: Ranges | None
             try:
-                ranges_m = parse_ranges(entry.line, unit, number, audit)
+                ranges_m = _parse_ranges(entry.line, number, audit)
             except ValueError:
                 ranges_m = None
             if ranges_m is None or len(ranges_m) != model.beam_count:
@@ -166,12 +175,13 @@ class TextLog:
         )
         return _Reading(survey, interleaving, pose_from_odometry, driven.fault is None, placeholders)
 
-    def _sample(self, sample: RangeSample, line: ScanLine) -> None:
+    @staticmethod
+    def _sample(sample: RangeSample, line: ScanLine) -> None:
         if not sample.wants(line.T_odom_base):
             return
         max_range_m = line.stated.max_range_m if line.stated is not None else SICK_MAX_RANGE_M
         with suppress(ValueError):
-            ranges_m = parse_ranges(line, self._dialect.metres_per_range_unit, 0, Audit())
+            ranges_m = _parse_ranges(line, 0, Audit())
             sample.add(line.T_odom_base, ranges_m, 0.0, max_range_m)
 
     def _first_look(self) -> tuple[Beams, Interleaving | None]:
@@ -187,7 +197,7 @@ class TextLog:
         if not scans:
             seen = f"; {audit.faults()}" if audit.faults() else ""
             raise SourceError(
-                f"{self._path}: no laser scan in this {self._dialect.name}{seen}; its lines are {self._kinds()}; "
+                f"{self._path}: no laser scan in this CARMEN log{seen}; its lines are {self._kinds()}; "
                 "give a log with scans"
             )
         return first_beams(scans, parameters)
@@ -203,7 +213,7 @@ class TextLog:
 
     def _parsed(self) -> Iterator[NumberedLine]:
         """Parse the log line by line; keeps the lines of a short log for the next pass."""
-        parse = self._dialect.parser()
+        parse = CarmenParser(is_raw(head(self._path)))
         kept, size, untimed = list[NumberedLine](), 0, 0
         for number, text in numbered_lines(self._path):
             try:
@@ -275,3 +285,18 @@ def _sound(lines: Iterable[NumberedLine], audit: Audit) -> Iterator[tuple[int, L
             audit.add(Fault.BROKEN_LINE, number)
         else:
             yield number, line
+
+
+def _parse_ranges(scan: ScanLine, number: int, audit: Audit) -> Ranges:
+    """Ranges in metres, shape (beam_count,), invalid ones NaN; raises ValueError if one is not a number."""
+    values = np.array(scan.range_text.split(), dtype=np.float64)
+    if not (values.min() >= 0.0 and values.max() < _LONGEST_RANGE_M):
+        finite, negative = np.isfinite(values), values < 0.0
+        for kind, count in (
+            (Fault.NON_FINITE_RANGE, np.count_nonzero(~finite)),
+            (Fault.NEGATIVE_RANGE, np.count_nonzero(negative & finite)),
+        ):
+            if count:
+                audit.add(kind, number, int(count))
+        values = np.where(finite & ~negative, np.minimum(values, _LONGEST_RANGE_M), nan)
+    return frozen(values, np.float32)
