@@ -154,26 +154,19 @@ def rest_page() -> str:
     app = create_app(Described())
     roles = dict(roles_of(app.routes))
     groups: dict[str, list[str]] = {}
-    parameters = []
     for path, operations in app.openapi()["paths"].items():
         for method, operation in operations.items():
             request = f"`{method.upper()} {path}`"
             who = roles[operation["summary"], path.removeprefix(PREFIX)]
             does = cell(operation["description"].partition("\n\n")[0])
             groups.setdefault(operation["tags"][0], []).append(f"| {request} | {who} | {does} |")
-            parameters += [
-                f"| {request} | `{each['name']}` | {each['in']} | {cell(allowed_values(each['schema']))} |"
-                for each in operation.get("parameters", ())
-                if each["in"] != "path"
-            ]
     parts = [
         "\n".join([f"## {name.capitalize()}", "", "| request | role | does |", "|---|---|---|", *rows, ""])
         for name, rows in groups.items()
     ]
     numbers = ["## Numbers in answers", "", "| answer | field | meaning and unit |", "|---|---|---|"]
     numbers += [f"| {answer} | `{field}` | {cell(meaning)} |" for answer, field, meaning in numbers_of(app.openapi())]
-    head = ["## Parameters", "", "| request | parameter | in | allowed |", "|---|---|---|---|"]
-    return "\n".join([REST, *parts, *numbers, "", *head, *parameters, ""])
+    return "\n".join([REST, *parts, *numbers, ""])
 
 
 def numbers_of(described: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
@@ -198,18 +191,6 @@ def roles_of(routes: Iterable[Any]) -> Iterator[tuple[tuple[str, str], str]]:
             yield (summary, route.path.removeprefix(PREFIX)), ", ".join(role.value for role in roles) or "anybody"
         elif hasattr(route, "original_router"):
             yield from roles_of(route.original_router.routes)
-
-
-def allowed_values(schema: dict[str, Any]) -> str:
-    """Type, bounds and default of a parameter."""
-    kinds = [part for part in schema.get("anyOf", [schema]) if part.get("type") != "null"]
-    kind = kinds[0]
-    words = [kind.get("type", kind.get("$ref", "").rpartition("/")[2])]
-    bounds = [("minimum", ">="), ("maximum", "<="), ("maxLength", "length <="), ("pattern", "pattern")]
-    words += [f"{sign} `{kind[key]}`" for key, sign in bounds if key in kind]
-    if schema.get("default") not in (None, ""):
-        words.append(f"default `{schema['default']}`")
-    return ", ".join(words)
 
 
 PAGES = {FOLDER / "commands.md": commands_page, FOLDER / "rest.md": rest_page}
