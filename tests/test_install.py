@@ -8,9 +8,12 @@ import sys
 import tomllib
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 import fcslam
+from fcslam.cli import EXTRAS
 from tools.dockerfile_in_root import steps
 
 pytestmark = pytest.mark.slow
@@ -122,26 +125,51 @@ def test_the_dockerfile_copies_files_that_are_there_and_not_ignored():
     assert [rest for word, rest in found if word in ("USER", "ENTRYPOINT")] == ["fcslam", '["fcslam"]']
 
 
-WITHOUT_SERVICE = """
+BLOCKER = """
 import sys
-from fcslam.cli import OF_THE_SERVICE
 class Absent:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in OF_THE_SERVICE:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        if name.partition(".")[0] in {packages!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 sys.meta_path.insert(0, Absent())
-from fcslam.cli import main
-sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_recordings_are_mapped_and_shown_without_the_packages_of_the_service(tmp_path):
-    log = LOGS / "anna.clf.xz"
-    fcslam_ = (sys.executable, "-c", WITHOUT_SERVICE)
-    run(*fcslam_, "map", log, "-o", tmp_path / "run", "-q", cwd=tmp_path)
-    run(*fcslam_, "show", tmp_path / "run", "--html", tmp_path / "run.html", cwd=tmp_path)
+@pytest.fixture
+def core(tmp_path):
+    """The command as with `pip install .`: this process and its children lack the packages of all extras."""
+    packages = {*EXTRAS, "onnxruntime", "torch", "onnx", "flwr", "mujoco", "ezdxf", "pyproj"}
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(BLOCKER.format(packages=packages))
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path / 'site'}{os.pathsep}{ROOT / 'src'}"}
+
+    def fcslam_(*words):
+        command = [sys.executable, "-m", "fcslam.cli", *map(str, words)]
+        return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path)
+
+    return fcslam_
+
+
+def test_a_lidar_is_mapped_and_shown_without_any_extra(core, tmp_path):
+    for words in (
+        ("map", LOGS / "anna.clf.xz", "-o", tmp_path / "run", "-q"),
+        ("show", tmp_path / "run", "--html", tmp_path / "run.html"),
+    ):
+        done = core(*words)
+        assert (done.returncode, done.stderr) == (0, "")
     assert "<html" in (tmp_path / "run.html").read_text(encoding="utf-8")
-    command = [*fcslam_, "serve", "--data", tmp_path / "data"]
-    served = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
-    assert served.returncode == 2
+    assert (tmp_path / "run" / "map.png").stat().st_size > 1000
+
+
+def test_a_missing_extra_is_named_in_one_line(core, tmp_path):
+    cv2.imwrite(str(tmp_path / "image.png"), np.random.default_rng(1).integers(0, 255, (96, 96), np.uint8))
+    served, described = (
+        core("serve", "--data", tmp_path / "data"),
+        core("tools", "extract", tmp_path, "-o", "x"),
+    )
+    assert [served.returncode, described.returncode] == [2, 2]
     assert re.fullmatch(r"fcslam: this needs \w+; install it: pip install 'fcslam\[service\]'\n", served.stderr)
+    assert re.fullmatch(
+        r"fcslam: describing camera images needs ONNX Runtime; install it: pip install 'fcslam\[camera\]'.*\n",
+        described.stderr,
+    )

@@ -40,8 +40,13 @@ from fcslam.errors import FcslamError, InputError, printable
 
 BAD_INPUT, INTERRUPTED, READER_GONE = 2, 130, 1
 """Exit codes: 2 for errors that the user can correct, 130 for Ctrl-C as in shells, 1 for a closed pipe as in click."""
-OF_THE_SERVICE = {"cryptography", "fastapi", "httpx", "prometheus_client", "starlette", "uvicorn"}
-"""Packages of the extra ``service``: mapping recordings needs none of them."""
+EXTRAS = {
+    **dict.fromkeys(
+        ("cryptography", "fastapi", "httpx", "prometheus_client", "starlette", "uvicorn"), "fcslam[service]"
+    ),
+    "matplotlib": "fcslam[plots]",
+}
+"""By package, the extra that installs it; mapping recordings needs none of them."""
 PROGRAM = "fcslam"
 MAPS, ROBOTS, STUDY = "Maps", "Robots and service", "Measurements and tools"
 RECORDINGS, LEARNING, SETUP = "Simulation and comparison", "Learning", "Setup"
@@ -200,9 +205,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except FcslamError as error:
         return _fail(str(error), BAD_INPUT)
     except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition(".")[0] not in OF_THE_SERVICE:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
             raise
-        return _fail(f"this needs {error.name}; install it: pip install 'fcslam[service]'", BAD_INPUT)
+        return _fail(f"this needs {error.name}; install it: pip install '{extra}'", BAD_INPUT)
     except OSError as error:
         if error.errno not in (errno.EPIPE, errno.ENOSPC) or error.filename is not None:
             raise

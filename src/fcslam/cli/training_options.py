@@ -47,7 +47,7 @@ QUICK_VALIDATION_PAIRS = 2
 
 def require_training_libraries(*others: str, extra: str = "train") -> None:
     """Raise TrainingError if a library that training needs, or one of ``others``, is missing."""
-    missing = [name for name in ("torch", "onnx", "onnxruntime", *others) if find_spec(name) is None]
+    missing = [name for name in ("torch", "onnx", "onnxruntime", "matplotlib", *others) if find_spec(name) is None]
     if missing:
         raise TrainingError(f"training needs {', '.join(missing)}; install it with: pip install 'fcslam[{extra}]'")
 

@@ -38,16 +38,28 @@ GreyImage = NDArray[np.uint8]
 """Shape (height, width)."""
 
 
+class MissingExtraError(FeatureError):
+    """A package is missing that an extra installs."""
+
+
 def load_onnx_runtime() -> Any:
     """Import ``onnxruntime`` without telemetry; call this before any other import of it.
 
     On Linux, the official builds since 1.29 send telemetry and keep an identifier and a database in
     ``~/.cache/Microsoft/DeveloperTools`` (https://github.com/microsoft/onnxruntime/pull/27379).
     ``disable_telemetry_events`` stops the events, but only the environment variable prevents the files.
+
+    Raises:
+        MissingExtraError: it is not installed.
     """
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
-    import onnxruntime
-
+    try:
+        import onnxruntime
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            "describing camera images needs ONNX Runtime; install it: pip install 'fcslam[camera]', or map without "
+            "cameras: robot.channels: [lidar]"
+        ) from error
     onnxruntime.disable_telemetry_events()  # in case another module imported it before
     return onnxruntime
 

@@ -165,7 +165,11 @@ def _main(path: Path) -> int:
 
     from fcslam.features.detector import OnnxConfig, OnnxDetector, load_onnx_runtime
 
-    load_onnx_runtime()
+    try:
+        load_onnx_runtime()
+    except FeatureError as error:
+        sys.stdout.write(one_line(str(error)))
+        return 1
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     most = pages * resource.getpagesize() + TRIAL_MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (most, most))

@@ -316,7 +316,7 @@ class _Session:
     def detector_versions(self) -> dict[Channel, str]:
         """Detector versions of the channels in use."""
         versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_extractor.detector_version}
-        return {channel: versions[channel] for channel in self._config.channels}
+        return {channel: found for channel in self._config.channels if (found := versions[channel]) is not None}
 
     def _hello(self) -> Hello:
         return Hello(self._robot, self.epoch, self._lasers, self.detector_versions)

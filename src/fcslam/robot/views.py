@@ -1,6 +1,7 @@
 """Camera views: descriptors of keyframe images with metric positions. The images stay on the robot."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.features.classical import OrbConfig, make_detector
-from fcslam.features.detector import GreyImage, OnnxConfig, decode_grey
+from fcslam.features.detector import FeatureDetector, GreyImage, MissingExtraError, OnnxConfig, decode_grey
 from fcslam.features.detector_file import open_detector_file
 from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.lidar_depth import LidarView, locate_among
@@ -58,17 +59,23 @@ class ViewExtractor:
     """Picks images that show something new and describes them."""
 
     def __init__(self, config: ViewsConfig, folder: KeyframeFolder | None = None) -> None:
-        """Load the detector; ``folder`` keeps the keyframes that are in the image buffer."""
-        self._detector = make_detector(config.detector, OrbConfig(), OnnxConfig(weights=config.weights))
+        """Load the detector, if its library is installed. ``folder`` keeps the keyframes of the image buffer."""
+        self._config = config
+        self._detector: FeatureDetector | None = None
+        with suppress(MissingExtraError):  # then the first image says so, as a robot may have a LiDAR alone
+            self._detector = self._make_detector()
         self._image_buffer = ImageBuffer()
         self._folder = folder
         self._last: tuple[int, FloatArray] | None = None
         """Keyscan and odometry of the last view."""
 
     @property
-    def detector_version(self) -> str:
-        """Version of the detector."""
-        return self._detector.version
+    def detector_version(self) -> str | None:
+        """Version of the detector; None if its library is not installed."""
+        return None if self._detector is None else self._detector.version
+
+    def _make_detector(self) -> FeatureDetector:
+        return make_detector(self._config.detector, OrbConfig(), OnnxConfig(weights=self._config.weights))
 
     def describe(
         self, image: CameraImage, scan: LaserScan, pose: ScanPose, scans: Sequence[LaserScan]
@@ -127,15 +134,16 @@ class ViewExtractor:
         return [view for view in views if view is not None]
 
     def _describe(self, image: KeyframeImage, picture: GreyImage) -> CameraView | None:
-        features = self._detector.detect(picture)
+        self._detector = detector = self._detector or self._make_detector()
+        features = detector.detect(picture)
         positions, placed = locate_among(features.keypoints_px, image.camera, image.surroundings)
         if placed.sum() < FEWEST_KEYPOINTS:
             return None
         if self._folder is not None:
-            self._folder.keep(image, features, self._detector.version)
+            self._folder.keep(image, features, detector.version)
         positions[:, :2] = se2.transform(image.T_keyscan_image, positions[:, :2])
         keypoints, codes = frozen(positions[placed], np.float32), frozen(features.descriptors[placed], np.uint8)
-        return CameraView(image.keyscan, keypoints, codes, self._detector.version)
+        return CameraView(image.keyscan, keypoints, codes, detector.version)
 
     def _is_new(self, keyscan: int, T_odom_base: FloatArray) -> bool:
         """Whether the robot moved enough since the last view; a keyscan has one view at most."""
