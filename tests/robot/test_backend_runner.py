@@ -7,7 +7,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future
 import pytest
 
 from fcslam.records import Channel, Constraint, ConstraintKind, Keyscan, Place
-from fcslam.robot.backend_runner import BlockExecutor, WorkerBackend, backend_process
+from fcslam.robot.backend_runner import BlockExecutor, WorkerBackend, copied_worker
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import encode
@@ -136,12 +136,13 @@ def contents_of(bodies):
 @pytest.mark.parametrize("block", [1, 8])
 def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothing(scans, block):
     expected = driven(scans)[1]
-    with backend_process("r", CONFIG, block) as backend:
+    with copied_worker() as executor:
+        backend = WorkerBackend("r", CONFIG, executor if block == 1 else BlockExecutor(executor, block))
         assert contents(driven(scans, backend)[1]) == contents(expected)
-        worker = backend._executor.submit(os.getpid).result()
+        worker = executor.submit(os.getpid).result()
         for stop in (signal.SIGINT, signal.SIGTERM):  # meant for the robot, which ends the worker itself
             os.kill(worker, stop)
-        assert backend._executor.submit(os.getpid).result() == worker
+        assert executor.submit(os.getpid).result() == worker
         os.kill(worker, signal.SIGKILL)
         robot, packets = driven(scans, backend)
         assert "BrokenProcessPool" in robot.packets.failure

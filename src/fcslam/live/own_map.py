@@ -18,6 +18,7 @@ from fcslam.errors import FcslamError
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.mission import MissionCloud, MissionConfig
 from fcslam.records import Correction, FloatArray
+from fcslam.robot.worker_object import WorkerObject
 from fcslam.runs import Run
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import SizedPacket, decode, measure
@@ -34,19 +35,19 @@ class OwnMap:
         self, robot: str, config: MissionConfig, executor: Executor, correct: Correct, first_epoch: int
     ) -> None:
         """Start a map in the only worker of ``executor``; session 0 of this start is that of ``first_epoch``."""
-        self._robot, self._executor, self._correct, self._first_epoch = robot, executor, correct, first_epoch
+        self._robot, self._correct, self._first_epoch = robot, correct, first_epoch
         self.failure: str | None = None
         """Why the map stopped growing; None if it grows."""
         self._applying: deque[Future[list[tuple[int, Correction]]]] = deque()
         self._kept: list[Packet] = []
         """Packets that the worker does not have yet: to hand over each for itself would cost scans time."""
         self._lock = threading.Lock()
-        executor.submit(_open, robot, config).result()
+        self._cloud = WorkerObject(executor, f"map of {robot}", MissionCloud, config)
 
     def restore(self, packets: Sequence[bytes]) -> None:
         """Apply the packets of earlier sessions, encoded, before those of this one; later."""
         if packets:
-            self._await(self._submit(_restore, packets))
+            self._await(self._cloud.call(_restore, packets))
 
     def put(self, packets: Sequence[Packet]) -> None:
         """Keep the next packets for ``hand_over``; each answer is of all packets so far."""
@@ -59,7 +60,7 @@ class OwnMap:
         with self._lock:
             if self._kept and self._kept[0].time < before_s:
                 packets, self._kept = self._kept, []
-                self._await(self._submit(_apply, packets, self._first_epoch))
+                self._await(self._cloud.call(_apply, packets, self._first_epoch))
 
     @property
     def backlog(self) -> int:
@@ -85,14 +86,6 @@ class OwnMap:
         """The result of all packets so far; arguments as in ``MissionCloud.run``."""
         return self._answer(MissionCloud.run, tracks, scans, recorded_s)
 
-    def _submit(self, function: Callable[..., Answer], *arguments: object) -> Future[Answer]:
-        try:
-            return self._executor.submit(_call, self._robot, function, *arguments)
-        except RuntimeError as error:  # the worker has ended, or the executor was shut down
-            failed: Future[Answer] = Future()
-            failed.set_exception(error)
-            return failed
-
     def _forget_applied(self) -> None:
         while self._applying and self._applying[0].done():
             self._applying.popleft()
@@ -115,23 +108,11 @@ class OwnMap:
     def _answer(self, function: Callable[..., Answer], *arguments: object) -> Answer:
         self.hand_over()
         try:
-            return self._submit(function, *arguments).result()
+            return self._cloud.call(function, *arguments).result()
         except FcslamError:
             raise
         except Exception as error:
             raise FcslamError(f"{self._robot}: the robot's map is gone: {type(error).__name__}: {error}") from error
-
-
-_clouds: dict[str, MissionCloud] = {}
-"""The maps of robots in this worker, by robot."""
-
-
-def _open(robot: str, config: MissionConfig) -> None:
-    _clouds[robot] = MissionCloud(config)
-
-
-def _call(robot: str, function: Callable[..., Answer], *arguments: object) -> Answer:
-    return function(_clouds[robot], *arguments)
 
 
 def _call_host(cloud: MissionCloud, function: Callable[..., Answer], *arguments: object) -> Answer:

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 from fcslam.errors import FeatureError
 from fcslam.processes import worker_pool
 from fcslam.robot.backend import BackendInput, RobotBackend, SessionConfig
+from fcslam.robot.worker_object import WorkerObject
 from fcslam.wire.messages import Body
 
 YIELD_TO_TRACKER = 5
@@ -49,13 +50,11 @@ class WorkerBackend:
 
     def __init__(self, robot: str, config: SessionConfig, executor: Executor, keyframes: Path | None = None) -> None:
         """Start the back end; ``keyframes`` as in ``RobotBackend``."""
-        self._robot = robot
-        self._executor = executor
-        executor.submit(_begin, robot, config, keyframes).result()
+        self._backend = WorkerObject(executor, f"back end of {robot}", RobotBackend, robot, config, keyframes)
 
     def submit(self, input: BackendInput) -> "Future[list[Body]]":
         """Queue the next input."""
-        return self._executor.submit(_process, self._robot, input)
+        return self._backend.submit(RobotBackend.process, input)
 
 
 class BlockExecutor(Executor):
@@ -151,15 +150,3 @@ def backend_process(robot: str, config: SessionConfig, block: int = 1) -> Iterat
     """
     with copied_worker() as executor:
         yield WorkerBackend(robot, config, executor if block == 1 else BlockExecutor(executor, block))
-
-
-_backends: dict[str, RobotBackend] = {}
-"""The back ends that run in this worker, by robot."""
-
-
-def _begin(robot: str, config: SessionConfig, keyframes: Path | None) -> None:
-    _backends[robot] = RobotBackend(robot, config, keyframes)
-
-
-def _process(robot: str, input: BackendInput) -> list[Body]:
-    return _backends[robot].process(input)

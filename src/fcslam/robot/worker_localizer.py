@@ -14,6 +14,7 @@ from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray
 from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd
 from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
+from fcslam.robot.worker_object import WorkerObject
 from fcslam.wire.messages import Body
 
 
@@ -34,70 +35,48 @@ class WorkerLocalizer:
 
     def __init__(self, robot: str, occupancy: OccupancyMap, initial: FloatArray | None, executor: Executor) -> None:
         """Load the map into the worker; arguments as for ``MapLocalizer``."""
-        self._robot, self._executor = robot, executor
         self.state = MapState(0, None, 0, 0)
         """After the newest input that the worker has handled."""
-        self.keyscans = 0
+        self.keyscans = self._sessions = 0
         """Number of keyscans so far."""
-        executor.submit(_begin, robot, occupancy, initial).result()
+        self._localizer = WorkerObject(executor, f"localizer of {robot}", _localizer, occupancy, initial)
 
     def submit(self, input: BackendInput) -> "Future[list[Body]]":
         """Queue the next input."""
         self.keyscans += isinstance(input, NewKeyscan)
-        return self._queue(_process, input)
+        self._sessions += isinstance(input, SessionEnd)
+        return self._queue(MapLocalizer.submit, input)
 
     def suggest(self, T_map_odom: FloatArray) -> None:
         """As ``MapLocalizer.suggest``, after the inputs so far."""
-        self._queue(_suggest, T_map_odom)
+        self._queue(MapLocalizer.suggest, T_map_odom)
 
-    def _queue(self, function: "Callable[..., MapState]", argument: object) -> "Future[list[Body]]":
+    def _queue(self, method: Callable[..., object], argument: object) -> "Future[list[Body]]":
         handled: Future[list[Body]] = Future()
+        session = self._sessions
 
-        def take(done: "Future[MapState]") -> None:
+        def take(done: "Future[Found]") -> None:
             error = FcslamError("the robot was closed") if done.cancelled() else done.exception()
             if error is None:
-                self.state = done.result()
+                self.state = MapState(session, *done.result())
                 handled.set_result([])
             else:  # nobody follows the robot any more
                 self.state = MapState(self.state.session, None, self.state.fixes, self.state.losses)
                 handled.set_exception(error)
 
-        try:
-            asked = self._executor.submit(function, self._robot, argument)
-        except RuntimeError as error:  # the worker has ended, or the executor was shut down
-            asked = Future()
-            asked.set_exception(error)
-        asked.add_done_callback(take)
+        self._localizer.call(_after, method, argument).add_done_callback(take)
         return handled
 
 
-@dataclass(slots=True)
-class _Localization:
-    """One robot in this worker."""
-
-    localizer: MapLocalizer
-    session: int = 0
-
-    @property
-    def state(self) -> MapState:
-        return MapState(self.session, self.localizer.estimate, self.localizer.fixes, self.localizer.losses)
+Found = tuple[MapEstimate | None, int, int]
+"""Estimate, fixes and losses."""
 
 
-_localizations: dict[str, _Localization] = {}
-"""By robot."""
+def _localizer(occupancy: OccupancyMap, initial: FloatArray | None) -> MapLocalizer:
+    return MapLocalizer(frozen_map(occupancy, "the map"), initial)
 
 
-def _begin(robot: str, occupancy: OccupancyMap, initial: FloatArray | None) -> None:
-    _localizations[robot] = _Localization(MapLocalizer(frozen_map(occupancy, "the map"), initial))
-
-
-def _process(robot: str, input: BackendInput) -> MapState:
-    here = _localizations[robot]
-    here.localizer.submit(input)
-    here.session += isinstance(input, SessionEnd)
-    return here.state
-
-
-def _suggest(robot: str, T_map_odom: FloatArray) -> MapState:
-    _localizations[robot].localizer.suggest(T_map_odom)
-    return _localizations[robot].state
+def _after(localizer: MapLocalizer, method: Callable[..., object], argument: object) -> Found:
+    """What is known once a method has been called."""
+    method(localizer, argument)
+    return localizer.estimate, localizer.fixes, localizer.losses
