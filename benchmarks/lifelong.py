@@ -94,16 +94,19 @@ def case(sessions: int, path_m: float, seed: int, kept: int) -> list[tuple]:
 
 def robots(sessions: int, path_m: float, seed: int) -> list[Any]:
     """The robot of each session: one building that changes."""
+    from worlds.changing import ChangingBuilding, close_doors
+
     from fcslam.lab.simulation.noise import LidarSettings
     from fcslam.lab.simulation.simulated_fleet import STAMP_SHIFT_S, SimulationSettings, simulate_fleet
 
     settings = SimulationSettings(
         robots=sessions, path_length_m=path_m, camera=None, lidar=LidarSettings(rate_hz=5.0),
-        moved_furniture=MOVED_FURNITURE, lasting_changes=True, closed_doors=CLOSED_DOORS,
+        moved_furniture=MOVED_FURNITURE,
     )  # fmt: skip
+    fleet = simulate_fleet(settings, seed, ChangingBuilding(settings.building))
     shift_s = BETWEEN_S - STAMP_SHIFT_S
     return [replace(robot, name=ROBOT, stamps=robot.stamps + k * shift_s, first_stamp=robot.first_stamp + k * shift_s)
-            for k, robot in enumerate(simulate_fleet(settings, seed).robots)]  # fmt: skip
+            for k, robot in enumerate(close_doors(fleet.robots, CLOSED_DOORS))]  # fmt: skip
 
 
 def with_people(robot: Any, seed: int) -> Iterator[Any]:

@@ -13,6 +13,7 @@ import common
 import numpy as np
 from certificate import Simulated
 from lifelong import building_now, labelled, segment_points, within
+from worlds.changing import ChangingBuilding
 
 from fcslam.geometry import se2
 from fcslam.lab.simulation.noise import LidarSettings
@@ -45,10 +46,9 @@ def main() -> None:
 
 def _judged(seed, path_m):
     settings = SimulationSettings(
-        robots=2, path_length_m=path_m, camera=None, lidar=LidarSettings(rate_hz=5.0), moved_furniture=0.3,
-        lasting_changes=True,
+        robots=2, path_length_m=path_m, camera=None, lidar=LidarSettings(rate_hz=5.0), moved_furniture=0.3
     )  # fmt: skip
-    first, second = simulate_fleet(settings, seed).robots
+    first, second = simulate_fleet(settings, seed, ChangingBuilding(settings.building)).robots
     mapped = run_mission([Simulated(first)], MissionConfig())
     followed = run_localization(Simulated(second), mapped.maps[0], MissionConfig(), update=True)
     path = mapped.trajectories[first.name]

@@ -24,7 +24,6 @@ from robustness import Recording
 
 from fcslam.lab.evaluation.relations import pose_table
 from fcslam.lab.simulation.noise import SCANNERS, LidarSettings
-from fcslam.lab.simulation.odometry import KINDS
 from fcslam.lab.simulation.options import OdometryKind, Scanner
 from fcslam.lab.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.metrics.relations import read_relations, relation_errors
@@ -73,7 +72,7 @@ def simulate(seeds: Sequence[int], path_m: float) -> Iterator[tuple[object, ...]
 
 def drive(lidar: LidarSettings, turn_rate: float, kind: OdometryKind, seed: int, path_m: float) -> SimulatedRobot:
     settings = SimulationSettings(
-        robots=1, path_length_m=path_m, camera=None, turn_rate_rad_s=turn_rate, lidar=lidar, drift=KINDS[kind]
+        robots=1, path_length_m=path_m, camera=None, turn_rate_rad_s=turn_rate, lidar=lidar, odometry=kind
     )
     (robot,) = simulate_fleet(settings, seed).robots
     return robot

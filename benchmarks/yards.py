@@ -26,7 +26,6 @@ from worlds.yard import Yard
 
 from fcslam.geometry import se2
 from fcslam.lab.simulation.noise import LidarSettings
-from fcslam.lab.simulation.odometry import KINDS
 from fcslam.lab.simulation.options import OdometryKind
 from fcslam.lab.simulation.simulated_fleet import SimulatedRobot, SimulationSettings, simulate_fleet
 from fcslam.mission.mission import MissionConfig, run_mission
@@ -113,7 +112,7 @@ def simulated_robot(kind: OdometryKind, seed: int, scanner: Scanner) -> Simulate
         robots=1,
         path_length_m=SHORTEST_M + LONGER_M * (seed % 10),
         lidar=lidar,
-        drift=KINDS[kind],
+        odometry=kind,
         camera=None,
     )
     return simulate_fleet(settings, seed, Yard()).robots[0]

@@ -6,7 +6,6 @@ import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -130,7 +129,7 @@ def logs(drawn, tmp_path_factory):
     folder = tmp_path_factory.mktemp("recordings")
     for robot in drawn.robots:
         write_carmen(folder / f"{robot.name}.clf", robot.scans())
-    write_ground_truth(drawn, folder, np.random.default_rng(0))
+    write_ground_truth(drawn, folder)
     return [folder / f"{robot.name}.clf" for robot in drawn.robots]
 
 

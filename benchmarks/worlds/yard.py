@@ -22,6 +22,7 @@ from fcslam.lab.simulation.floorplan import (
     segments_of,
 )
 from fcslam.lab.simulation.layouts import Lane
+from fcslam.lab.simulation.world import World
 from fcslam.records import FloatArray, frozen
 
 from .outdoor_rays import OutdoorRayCaster
@@ -73,20 +74,20 @@ class _Site:
         return self.stand(kind, disc(radius) + centre)
 
 
-@dataclass(frozen=True, slots=True)
-class Yard:
+class Yard(World):
     """A yard as the world of a fleet, for LiDARs."""
 
-    slope: float = SLOPE
-    """Root mean square slope in each direction."""
+    def __init__(self, slope: float = SLOPE) -> None:
+        """``slope``: root mean square in each direction."""
+        self._slope = slope
 
     def draw(self, rng: np.random.Generator) -> YardPlan:
-        return draw_yard(rng, self.slope)
+        return draw_yard(rng, self._slope)
 
     def goals(self, plan: FloorPlan, robots: int, length_m: float, rng: np.random.Generator) -> list[FloatArray]:  # noqa: ARG002
         return draw_starts(plan, robots, rng)
 
-    def changed(self, plan: YardPlan, share: float, rng: np.random.Generator, visited: FloatArray | None) -> YardPlan:  # noqa: ARG002
+    def changed(self, plan: YardPlan, goals: FloatArray, share: float, rng: np.random.Generator) -> YardPlan:  # noqa: ARG002
         return move_cars(plan, share, rng)
 
     def route(self, plan: FloorPlan, goals: FloatArray, length_m: float, rng: np.random.Generator) -> FloatArray:

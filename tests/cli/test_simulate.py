@@ -30,7 +30,7 @@ def test_recordings_can_be_read_and_the_truth_lies_beside_them(simulated):
         np.testing.assert_allclose([scan.stamp for scan in scans], stamps, atol=1e-9)
         path_m = np.sum(np.hypot(*np.diff(poses[:, :2], axis=0).T))
         assert path_m == pytest.approx(6.0, abs=0.1)
-    assert sorted(path.name for path in (simulated / "ground_truth").iterdir()) == ["map.pgm", "map.yaml", "relations"]
+    assert sorted(path.name for path in (simulated / "ground_truth").iterdir()) == ["map.pgm", "map.yaml"]
 
 
 def test_a_scanner_is_as_asked_and_a_file_overrides_it(tmp_path):

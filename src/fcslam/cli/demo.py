@@ -63,7 +63,7 @@ def demo(
         print_line(console, f"{stage} of 3 {text}")
 
     begin(1, f"simulate: {robots} robots drive {settings.path_length_m:g} m each; their starts are unknown")
-    recordings = record_fleet(fleet, output / RECORDINGS, seed, console)
+    recordings = record_fleet(fleet, output / RECORDINGS, console)
     sources = [open_source(place) for place in recordings]
     begin(2, "map each robot, recognise places, fuse the maps")
     with live_page(output / RUN) if live else nullcontext() as page:

@@ -64,7 +64,6 @@ def simulate(
 ) -> None:
     """Simulate robots that drive through a building, and record their LiDARs, cameras and true poses."""
     from fcslam.lab.simulation.noise import SCANNERS
-    from fcslam.lab.simulation.odometry import KINDS
     from fcslam.lab.simulation.recording import prepare_fleet_folder
     from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 
@@ -75,22 +74,19 @@ def simulate(
         "building": building,
         "path_length_m": path_length,
         "lighting": tuple(lighting) if lighting else None,
+        "odometry": odometry,
     }
     settings = settings.model_copy(update={key: value for key, value in given.items() if value is not None})
-    if odometry is not None:
-        settings = settings.model_copy(update={"drift": KINDS[odometry]})  # none is a kind, too
     if no_camera:
         settings = settings.model_copy(update={"camera": None})
     fleet = simulate_fleet(settings, seed)
     output = output or new_folder(RECORDINGS)
     prepare_fleet_folder(output, settings, seed)
-    record_fleet(fleet, output, seed, notices())
+    record_fleet(fleet, output, notices())
 
 
-def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Console") -> list[Path]:
+def record_fleet(fleet: "SimulatedFleet", output: Path, console: "Console") -> list[Path]:
     """Write a recording of each robot and the truth into the folder ``output``; returns the recordings."""
-    import numpy as np
-
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.lab.simulation.recording import record_robot, write_ground_truth
     from fcslam.records import Odometry
@@ -122,7 +118,7 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, seed: int, console: "Con
                 stopped.set()
         display.start("writing")
         try:
-            write_ground_truth(fleet, output, np.random.default_rng(seed))
+            write_ground_truth(fleet, output)
         except OSError as error:
             raise OutputError(f"{output}: cannot be written ({error}); make room or choose another place") from error
     _report(fleet, recordings, time.perf_counter() - began, console)

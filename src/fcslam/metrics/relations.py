@@ -195,14 +195,6 @@ def read_relations(path: Path) -> Relations:
     return Relations(frozen(table[:, :2]), frozen(table[:, [2, 3, 7]]))
 
 
-def write_relations(path: Path, relations: Relations) -> None:
-    """Write ``relations`` in the format of ``read_relations``: stamps with six decimals, other numbers with nine."""
-    x, y, theta = relations.T_1_2.T
-    zeros = np.zeros(len(relations))
-    columns = (*relations.stamps.T, x, y, zeros, zeros, zeros, theta)
-    np.savetxt(path, np.column_stack(columns), fmt="%.6f %.6f %.9f %.9f %d %d %d %.9f")
-
-
 def _parse(lines: Iterable[str], path: Path) -> list[list[float]]:
     """Rows of eight numbers; skips blank lines and comments."""
     rows = []

@@ -12,7 +12,7 @@ from fcslam.errors import EvaluationError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.closures import ClosureScope, closure_rows
 from fcslam.lab.evaluation.relations import pose_table
-from fcslam.metrics.relations import Relations, write_relations
+from fcslam.metrics.relations import Relations
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, RobotTrajectory, Run
 
@@ -21,6 +21,14 @@ ROUND = 50
 
 FRAMES = ((3.0, -1.0, 0.4), (20.0, 7.0, -2.0))
 CANDIDATE, VERIFIED, ACCEPTED, REJECTED, REVOKED = ClosureStatus
+
+
+def write_relations(path, relations):
+    """In the format of ``read_relations``."""
+    x, y, theta = relations.T_1_2.T
+    zeros = np.zeros(len(relations))
+    columns = (*relations.stamps.T, x, y, zeros, zeros, zeros, theta)
+    np.savetxt(path, np.column_stack(columns), fmt="%.6f %.6f %.9f %.9f %d %d %d %.9f")
 
 
 def truth(step):

@@ -9,11 +9,8 @@ from fcslam.lab.simulation.decoration import light_of
 from fcslam.lab.simulation.floorplan import (
     DOOR_M,
     PieceKind,
-    doors_after,
-    doors_of,
     draw_floor_plan,
     move_furniture,
-    with_closed_doors,
 )
 from fcslam.lab.simulation.options import Building, Lighting
 from fcslam.lab.simulation.route import schedule
@@ -123,24 +120,3 @@ def test_furniture_moves_in_the_visited_rooms_only():
     ]
     assert changed
     assert all(room.contains(piece.centre[None]) for piece in changed)
-
-
-def test_doors_that_a_robot_drives_through_are_open_and_far_ones_stay_as_they_were():
-    plan = draw_floor_plan(np.random.default_rng(4))
-    doors = doors_of(plan)
-    centres = np.array([door.centre for door in doors])
-    everything = frozenset(range(len(doors)))
-    far = frozenset(np.flatnonzero(np.linalg.norm(centres - centres[0], axis=1) > 4.0).tolist())
-    assert 0 < len(far) < len(doors) - 1
-    through = doors_after(plan, everything, 1.0, centres[:1], np.random.default_rng(0))
-    assert through == everything - {0}
-    assert doors_after(plan, everything, 0.0, centres[:1], np.random.default_rng(0)) == far
-    assert doors_after(plan, frozenset(), 1.0, centres[:1], np.random.default_rng(0)) == everything - far - {0}
-
-
-def test_a_closed_door_is_a_wall():
-    plan = draw_floor_plan(np.random.default_rng(4))
-    closed = with_closed_doors(plan, frozenset({2}))
-    assert len(closed.segments) == len(plan.segments) + 4
-    assert closed.pieces[-1].kind is PieceKind.WALL
-    np.testing.assert_array_equal(closed.pieces[-1].outline, doors_of(plan)[2].outline)

@@ -10,10 +10,9 @@ import yaml
 from fcslam.lab.simulation.floorplan import PieceKind
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.options import Building
-from fcslam.lab.simulation.recording import true_map, true_relations, write_ground_truth
+from fcslam.lab.simulation.recording import true_map, write_ground_truth
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.maps.occupancy_map import Occupancy
-from fcslam.metrics.relations import PoseTable, read_relations, relation_errors
 from tests.lab.simulation.driving import distances
 
 pytestmark = pytest.mark.slow
@@ -76,26 +75,12 @@ def test_noise_does_not_reach_the_truth(fleet, seen):
     np.testing.assert_array_equal(true_map(simulate_fleet(noisy, 1)).cells, seen.cells)
 
 
-def test_the_files_hold_the_map_and_relations_that_are_true(fleet, seen, tmp_path):
-    write_ground_truth(fleet, tmp_path, np.random.default_rng(0))
-    assert sorted(path.name for path in (tmp_path / "ground_truth").iterdir()) == ["map.pgm", "map.yaml", "relations"]
+def test_the_files_hold_the_map(fleet, seen, tmp_path):
+    write_ground_truth(fleet, tmp_path)
+    assert sorted(path.name for path in (tmp_path / "ground_truth").iterdir()) == ["map.pgm", "map.yaml"]
     about = yaml.safe_load((tmp_path / "ground_truth" / "map.yaml").read_text())
     assert about["resolution"] == 0.05
     assert tuple(about["origin"][:2]) == seen.origin_xy
     pixels = cv2.imread(str(tmp_path / "ground_truth" / about["image"]), cv2.IMREAD_GRAYSCALE)[::-1]
     np.testing.assert_array_equal(pixels == 0, seen.cells == Occupancy.OCCUPIED)
     np.testing.assert_array_equal(pixels == 254, seen.cells == Occupancy.FREE)
-    robots = fleet.robots
-    table = PoseTable.of(
-        np.concatenate([robot.stamps for robot in robots]), np.concatenate([robot.T_building_base for robot in robots])
-    )
-    errors = relation_errors(read_relations(tmp_path / "ground_truth" / "relations"), table)
-    assert errors.used == errors.total == 2000
-    assert errors.translation.maximum < 1e-6
-
-
-def test_true_relations_span_robots(fleet):
-    relations = true_relations(fleet.robots, np.random.default_rng(0), count=500)
-    milliseconds = np.round(relations.stamps * 1000).astype(int) % 10
-    assert np.sum(milliseconds[:, 0] != milliseconds[:, 1]) > 100
-    assert np.hypot(relations.T_1_2[:, 0], relations.T_1_2[:, 1]).max() < 5.0

@@ -1,5 +1,6 @@
 """Errors of sensors: odometry drifts and ranges are noisy as the settings say."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,8 +13,7 @@ from fcslam.lab.simulation.floorplan import draw_floor_plan
 from fcslam.lab.simulation.noise import LidarSettings, simulate_ranges
 from fcslam.lab.simulation.odometry import (
     KINDS,
-    OdometryFaults,
-    OdometryNoiseSettings,
+    OdometryErrors,
     read_odometry,
     simulate_odometry,
 )
@@ -22,9 +22,7 @@ from fcslam.lab.simulation.simulated_fleet import SimulationSettings
 from fcslam.records import LaserModel
 from tests.lab.simulation.driving import drive, route
 
-NO_DRIFT = OdometryNoiseSettings(
-    travel_noise_m=0, heading_noise_rad=0, turn_noise_rad=0, scale_bias=0, veer_bias_rad_m=0
-)
+NO_DRIFT = OdometryErrors(travel_noise_m=0, heading_noise_rad=0, turn_noise_rad=0, scale_bias=0, veer_bias_rad_m=0)
 STRAIGHT = np.column_stack((np.linspace(0.0, 20.0, 401), np.zeros((401, 2))))
 
 
@@ -54,7 +52,7 @@ def test_wheels_without_faults_tell_the_truth():
 
 
 def test_heading_noise_grows_with_the_square_root_of_the_way():
-    settings = NO_DRIFT.model_copy(update={"heading_noise_rad": 0.01})
+    settings = replace(NO_DRIFT, heading_noise_rad=0.01)
     rng = np.random.default_rng(5)
     headings = np.array([simulate_odometry(STRAIGHT, settings, rng)[:, 2] for _ in range(400)])
     assert np.std(headings[:, 80]) == pytest.approx(0.02, rel=0.15)
@@ -67,7 +65,7 @@ def test_heading_noise_grows_with_the_square_root_of_the_way():
 def test_biases_grow_with_what_causes_them(bias, turn_share, travel_share):
     turning = np.column_stack((np.zeros((101, 2)), np.linspace(0.0, 3.0, 101)))
     driving = np.column_stack((np.linspace(0.0, 3.0, 101), np.zeros((101, 2))))
-    settings, rng = NO_DRIFT.model_copy(update={bias: 0.01}), np.random.default_rng(6)
+    settings, rng = replace(NO_DRIFT, **{bias: 0.01}), np.random.default_rng(6)
     for truth, share in ((turning, turn_share), (driving, travel_share)):
         wrong = np.array([simulate_odometry(truth, settings, rng)[:, 2] - truth[:, 2] for _ in range(400)])
         assert np.std(wrong[:, 100]) == pytest.approx(share * 0.03, rel=0.15, abs=1e-12)
@@ -75,7 +73,7 @@ def test_biases_grow_with_what_causes_them(bias, turn_share, travel_share):
 
 
 def test_slips_make_odometry_longer_and_nothing_else():
-    settings = NO_DRIFT.model_copy(update={"slips_per_m": 0.5, "slip_m": 0.04})
+    settings = replace(NO_DRIFT, slips_per_m=0.5, slip_m=0.04)
     rng = np.random.default_rng(0)
     ends = np.array([simulate_odometry(STRAIGHT, settings, rng)[-1] for _ in range(300)])
     assert np.mean(ends[:, 0]) == pytest.approx(20.0 + 20.0 * 0.5 * 0.04, abs=0.04)
@@ -86,7 +84,7 @@ STAMPS = 100.0 + 0.02 * np.arange(401)
 
 
 def read(truth=STRAIGHT, seed=3, noise=NO_DRIFT, **faults):
-    settings = noise.model_copy(update={"faults": OdometryFaults(**faults)})
+    settings = replace(noise, **faults)
     return read_odometry(STAMPS, truth, settings, np.random.default_rng(seed))
 
 
@@ -138,7 +136,7 @@ def test_every_kind_of_odometry_has_its_settings():
 @pytest.mark.parametrize("seed", range(3))
 def test_default_odometry_is_bad_enough_to_need_a_map(seed):
     truth = true_drive(seed)
-    odometry = simulate_odometry(truth, SimulationSettings().drift, np.random.default_rng(seed))
+    odometry = simulate_odometry(truth, KINDS[OdometryKind.DEFAULT], np.random.default_rng(seed))
     end = se2.between(se2.between(truth[0], truth[-1]), odometry[-1])
     assert 0.1 < np.hypot(end[0], end[1]) < 10.0
 

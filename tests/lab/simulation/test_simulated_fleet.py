@@ -127,32 +127,6 @@ def test_furniture_moves_before_every_robot_but_the_first():
     assert np.any(moved.robots[1].plan.segments != still.plan.segments)
 
 
-def moved_pieces(before, after):
-    pairs = zip(before.plan.pieces, after.plan.pieces, strict=True)
-    return sum(not np.array_equal(a.outline, b.outline) for a, b in pairs)
-
-
-def test_lasting_changes_are_found_by_later_robots():
-    fleet = simulate_fleet(
-        TINY.model_copy(update={"robots": 3, "moved_furniture": 0.5, "lasting_changes": True, "path_length_m": 12.0}), 1
-    )
-    first, second, third = fleet.robots
-    assert moved_pieces(first, second) > 0
-    assert moved_pieces(first, third) > moved_pieces(second, third)
-
-
-def test_closed_doors_are_on_no_way():
-    settings = TINY.model_copy(update={"closed_doors": 1.0})
-    for robot, open_ in zip(simulate_fleet(settings, 1).robots, simulate_fleet(TINY, 1).robots, strict=True):
-        closed = robot.plan.pieces[len(open_.plan.pieces) :]
-        np.testing.assert_array_equal(robot.T_building_base, open_.T_building_base)
-        assert closed
-        for door in closed:
-            assert np.linalg.norm(robot.T_building_base[:, :2] - door.centre, axis=1).min() > 0.9
-    with pytest.raises(SimulationError, match="closed doors are simulated for LiDARs only"):
-        simulate_fleet(settings.model_copy(update={"camera": CameraSettings()}), 1)
-
-
 def test_too_many_robots_for_the_building():
     with pytest.raises(SimulationError, match=r"'flat'.* too small for 50 robots; simulate at most \d"):
         simulate_fleet(TINY.model_copy(update={"robots": 50}), 1)

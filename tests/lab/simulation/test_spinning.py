@@ -7,7 +7,6 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lab.simulation.noise import SCANNERS
-from fcslam.lab.simulation.odometry import KINDS
 from fcslam.lab.simulation.options import Building, OdometryKind, Scanner
 from fcslam.lab.simulation.recording import record_robot
 from fcslam.lab.simulation.route import Schedule
@@ -29,7 +28,7 @@ def robot(scanner, odometry=OdometryKind.GOOD, building=Building.FLAT, path_leng
     """A robot without a camera that turns at 2 rad/s."""
     settings = SimulationSettings(
         building=building, robots=1, path_length_m=path_length_m, camera=None, turn_rate_rad_s=2.0,
-        lidar=SCANNERS[scanner].model_copy(update=lidar), drift=KINDS[odometry],
+        lidar=SCANNERS[scanner].model_copy(update=lidar), odometry=odometry,
     )  # fmt: skip
     return simulate_fleet(settings, seed).robots[0]
 

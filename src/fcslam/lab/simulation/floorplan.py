@@ -27,8 +27,6 @@ DISC_CORNERS = 8
 
 _ATTEMPTS = 20
 """Attempts to place a piece of furniture before it is omitted."""
-_DRIVEN_BY_M = 4.0
-"""Distance up to which a robot sees whether a door is closed."""
 _SHIFT_M, _TURN_RAD = 0.4, 0.3
 """Standard deviations of the shift and the turn of a moved piece of furniture."""
 
@@ -140,35 +138,6 @@ def move_furniture(
         for piece in plan.pieces
     ]
     return replace(plan, pieces=tuple(moved), segments=segments_of(moved))
-
-
-def doors_after(
-    plan: FloorPlan, closed: frozenset[int], share: float, route: FloatArray, rng: np.random.Generator
-) -> frozenset[int]:
-    """Which doors are closed while a robot drives, by their number in ``doors_of``.
-
-    The doors that it drives through are open. Of those that it drives by, a ``share`` is closed; the others stay as
-    they were. ``closed``: doors that were closed before; ``route``: positions of the robot, shape (N, 2).
-    """
-    after: set[int] = set()
-    for number, door in enumerate(doors_of(plan)):
-        distance = np.linalg.norm(route - door.centre, axis=1).min()
-        is_closed = bool(rng.random() < share) if distance < _DRIVEN_BY_M else number in closed
-        if is_closed and distance > DOOR_M:
-            after.add(number)
-    return frozenset(after)
-
-
-def with_closed_doors(plan: FloorPlan, closed: frozenset[int]) -> FloorPlan:
-    """The building with these doors closed."""
-    doors = doors_of(plan)
-    pieces = (*plan.pieces, *(Piece(PieceKind.WALL, doors[number].outline) for number in sorted(closed)))
-    return replace(plan, pieces=pieces, segments=segments_of(pieces))
-
-
-def doors_of(plan: FloorPlan) -> list[Piece]:
-    """The lintels of all doors."""
-    return [piece for piece in plan.pieces if piece.kind is PieceKind.LINTEL]
 
 
 def _moved(piece: Piece, room: Room, rng: np.random.Generator) -> Piece:

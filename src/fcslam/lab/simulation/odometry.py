@@ -1,11 +1,11 @@
 """Readings of simulated wheel odometry with their errors."""
 
+import math
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lab.simulation.options import OdometryKind
 from fcslam.records import SAME_STAMP_S, FloatArray, Odometry, frozen
@@ -16,69 +16,49 @@ _CARPET_M = 4.0
 """Side of a piece of carpet."""
 
 
-class OdometryFaults(Settings):
-    """Faults of wheel odometry beyond noise."""
+@dataclass(frozen=True, slots=True)
+class OdometryErrors:
+    """Errors of wheel odometry: noise along the path, biases drawn once for each robot, and errors."""
 
-    carpet_slip: float = Field(
-        default=0.0, ge=0.0, description="share by which wheels turn too far on carpet, a quarter of the floor"
-    )
-    update_hz: float | None = Field(
-        default=None, gt=0.0, description="changes of the pose per second [Hz]; null: every reading is new"
-    )
-    delay_s: float = Field(default=0.0, ge=0.0, description="time by which the stamp of a reading is late [s]")
-    reset_at: float | None = Field(
-        default=None, gt=0.0, lt=1.0, description="share of the drive after which the odometry starts at zero again"
-    )
-
-
-class OdometryNoiseSettings(Settings):
-    """Errors of wheel odometry: noise along the path, and biases drawn once for each robot."""
-
-    travel_noise_m: float = Field(
-        default=0.01,
-        ge=0.0,
-        description="standard deviation of the measured distance after 1 m, grows with the root of the distance [m]",
-    )
-    heading_noise_rad: float = Field(
-        default=0.01,
-        ge=0.0,
-        description="standard deviation of the heading after 1 m, grows with the root of the distance [rad]",
-    )
-    turn_noise_rad: float = Field(
-        default=0.02,
-        ge=0.0,
-        description="standard deviation of the heading after a turn of 1 rad, grows with the root of the turn [rad]",
-    )
-    scale_bias: float = Field(
-        default=0.01, ge=0.0, description="standard deviation of the relative scale error of distances and of turns"
-    )
-    veer_bias_rad_m: float = Field(
-        default=0.003, ge=0.0, description="standard deviation of a robot's constant heading drift [rad/m]"
-    )
-    slips_per_m: float = Field(default=0.0, ge=0.0, description="mean number of wheel slips per distance [1/m]")
-    slip_m: float = Field(default=0.05, ge=0.0, description="mean distance that a wheel slip adds to the odometry [m]")
-    slip_limit_m: float | None = Field(
-        default=None, gt=0.0, description="largest distance that a wheel slip adds [m]; null for no limit"
-    )
-    slip_turn_rad: float = Field(
-        default=0.0, ge=0.0, description="largest turn that a wheel slip adds, to either side [rad]"
-    )
-    faults: OdometryFaults = Field(default=OdometryFaults(), description="faults beyond noise")
+    travel_noise_m: float = 0.01
+    """Standard deviation of the measured distance after 1 m; it grows with the root of the distance."""
+    heading_noise_rad: float = 0.01
+    """Standard deviation of the heading after 1 m; it grows with the root of the distance."""
+    turn_noise_rad: float = 0.02
+    """Standard deviation of the heading after a turn of 1 rad; it grows with the root of the turn."""
+    scale_bias: float = 0.01
+    """Standard deviation of the relative scale error of distances and of turns."""
+    veer_bias_rad_m: float = 0.003
+    """Standard deviation of a robot's constant heading drift."""
+    slips_per_m: float = 0.0
+    """Mean number of wheel slips."""
+    slip_m: float = 0.05
+    """Mean distance that a wheel slip adds."""
+    slip_limit_m: float = math.inf
+    """Largest distance that a wheel slip adds."""
+    slip_turn_rad: float = 0.0
+    """Largest turn that a wheel slip adds, to either side."""
+    carpet_slip: float = 0.0
+    """Share by which wheels turn too far on carpet, a quarter of the floor."""
+    update_hz: float | None = None
+    """Changes of the pose per second; None: every reading is new."""
+    delay_s: float = 0.0
+    """Time by which the stamp of a reading is late."""
+    reset_at: float | None = None
+    """Share of the drive after which the odometry starts at zero again."""
 
 
-_GOOD = OdometryNoiseSettings(heading_noise_rad=0.003, veer_bias_rad_m=0.001, scale_bias=0.015)
+_GOOD = OdometryErrors(heading_noise_rad=0.003, veer_bias_rad_m=0.001, scale_bias=0.015)
 
-KINDS: dict[OdometryKind, OdometryNoiseSettings | None] = {
-    OdometryKind.DEFAULT: OdometryNoiseSettings(slips_per_m=0.05),
+KINDS: dict[OdometryKind, OdometryErrors | None] = {
+    OdometryKind.DEFAULT: OdometryErrors(slips_per_m=0.05),
     OdometryKind.GOOD: _GOOD,
-    OdometryKind.SLIPPING: _GOOD.model_copy(
-        update={"slips_per_m": 0.05, "slip_m": 0.25, "slip_limit_m": 0.7, "slip_turn_rad": 0.1}
-    ),
-    OdometryKind.SCALED: _GOOD.model_copy(update={"scale_bias": 0.1}),
-    OdometryKind.CARPET: _GOOD.model_copy(update={"faults": OdometryFaults(carpet_slip=0.2)}),
-    OdometryKind.STEPS: _GOOD.model_copy(update={"faults": OdometryFaults(update_hz=5.0)}),
-    OdometryKind.LATE: _GOOD.model_copy(update={"faults": OdometryFaults(delay_s=0.2)}),
-    OdometryKind.RESET: _GOOD.model_copy(update={"faults": OdometryFaults(reset_at=0.5)}),
+    OdometryKind.SLIPPING: replace(_GOOD, slips_per_m=0.05, slip_m=0.25, slip_limit_m=0.7, slip_turn_rad=0.1),
+    OdometryKind.SCALED: replace(_GOOD, scale_bias=0.1),
+    OdometryKind.CARPET: replace(_GOOD, carpet_slip=0.2),
+    OdometryKind.STEPS: replace(_GOOD, update_hz=5.0),
+    OdometryKind.LATE: replace(_GOOD, delay_s=0.2),
+    OdometryKind.RESET: replace(_GOOD, reset_at=0.5),
     OdometryKind.NONE: None,
 }
 """The errors of each kind of wheel odometry."""
@@ -109,51 +89,47 @@ class Readings(NamedTuple):
 
 
 def read_odometry(
-    stamps: FloatArray, T_building_base: FloatArray, settings: OdometryNoiseSettings, rng: np.random.Generator
+    stamps: FloatArray, T_building_base: FloatArray, errors: OdometryErrors, rng: np.random.Generator
 ) -> Readings:
-    """The readings of a robot that is at the true poses (N, 3) at ``stamps`` (N,), with all faults."""
-    faults, poses = settings.faults, simulate_odometry(T_building_base, settings, rng)
-    if faults.update_hz is not None:
+    """The readings of a robot that is at the true poses (N, 3) at ``stamps`` (N,), with all errors."""
+    poses = simulate_odometry(T_building_base, errors, rng)
+    if errors.update_hz is not None:
         _, first, number = np.unique(
-            np.floor((stamps - stamps[0] + SAME_STAMP_S) * faults.update_hz), return_index=True, return_inverse=True
+            np.floor((stamps - stamps[0] + SAME_STAMP_S) * errors.update_hz), return_index=True, return_inverse=True
         )
         poses = poses[first[number]]
-    if faults.reset_at is not None:
-        after = int(faults.reset_at * len(poses))
+    if errors.reset_at is not None:
+        after = int(errors.reset_at * len(poses))
         poses = np.concatenate((poses[:after], se2.between(poses[after], poses[after:])))
-    return Readings(frozen(stamps + faults.delay_s), frozen(poses))
+    return Readings(frozen(stamps + errors.delay_s), frozen(poses))
 
 
-def simulate_odometry(
-    T_building_base: FloatArray, settings: OdometryNoiseSettings, rng: np.random.Generator
-) -> FloatArray:
+def simulate_odometry(T_building_base: FloatArray, errors: OdometryErrors, rng: np.random.Generator) -> FloatArray:
     """``T_odom_base`` (N, 3) of a robot along true poses (N, 3), metres and radians; the first is zero."""
     twists = se2.log(se2.relative(T_building_base))
     travel, turn = np.abs(twists[:, 0]), np.abs(twists[:, 2])
-    scale_travel, scale_turn = 1.0 + rng.normal(0.0, settings.scale_bias, 2)
-    veer = rng.normal(0.0, settings.veer_bias_rad_m)
+    scale_travel, scale_turn = 1.0 + rng.normal(0.0, errors.scale_bias, 2)
+    veer = rng.normal(0.0, errors.veer_bias_rad_m)
     noise = rng.normal(0.0, 1.0, (3, len(twists)))
     wrong = np.column_stack(
         (
-            scale_travel * twists[:, 0] + settings.travel_noise_m * np.sqrt(travel) * noise[0],
+            scale_travel * twists[:, 0] + errors.travel_noise_m * np.sqrt(travel) * noise[0],
             twists[:, 1],
             scale_turn * twists[:, 2]
             + veer * travel
-            + settings.heading_noise_rad * np.sqrt(travel) * noise[1]
-            + settings.turn_noise_rad * np.sqrt(turn) * noise[2],
+            + errors.heading_noise_rad * np.sqrt(travel) * noise[1]
+            + errors.turn_noise_rad * np.sqrt(turn) * noise[2],
         )
     )
-    if settings.slips_per_m:
-        slips = rng.poisson(settings.slips_per_m * travel)
-        slipped_m = rng.exponential(settings.slip_m, len(travel)) * slips
-        if settings.slip_limit_m is not None:
-            slipped_m = np.minimum(slipped_m, settings.slip_limit_m)
+    if errors.slips_per_m:
+        slips = rng.poisson(errors.slips_per_m * travel)
+        slipped_m = np.minimum(rng.exponential(errors.slip_m, len(travel)) * slips, errors.slip_limit_m)
         wrong[:, 0] += slipped_m * np.sign(twists[:, 0])
-        if settings.slip_turn_rad:
-            wrong[:, 2] += rng.uniform(-settings.slip_turn_rad, settings.slip_turn_rad, len(travel)) * (slips > 0)
-    if settings.faults.carpet_slip:
+        if errors.slip_turn_rad:
+            wrong[:, 2] += rng.uniform(-errors.slip_turn_rad, errors.slip_turn_rad, len(travel)) * (slips > 0)
+    if errors.carpet_slip:
         column, row = np.floor(T_building_base[:-1, :2] / _CARPET_M).T % 2
-        wrong *= 1.0 + settings.faults.carpet_slip * (column * row)[:, None]
+        wrong *= 1.0 + errors.carpet_slip * (column * row)[:, None]
     return _chain(se2.exp(wrong))
 
 

@@ -1,10 +1,10 @@
-"""Writes the recordings of a simulated fleet, and its ground truth: relations between scans, and the true map."""
+"""Writes the recordings of a simulated fleet, and its ground truth: the true poses and the true map."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from itertools import product
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -14,8 +14,7 @@ from fcslam.errors import OutputError, writing
 from fcslam.geometry import se2
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings
 from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
-from fcslam.metrics.relations import ACROSS_ROBOTS_GAP_S, Relations, write_relations
-from fcslam.records import FloatArray, LaserModel, SensorRecord, frozen
+from fcslam.records import FloatArray, LaserModel, SensorRecord
 from fcslam.runs import write_tum
 from fcslam.sources import write_bag
 from fcslam.storage.files import write_file
@@ -31,7 +30,6 @@ RESOLUTION_M = 0.05
 
 _STEP_M, _TURN_RAD = 0.2, 0.2
 """Distance and turn between the scans that are drawn; closer scans add almost nothing to the map."""
-_REACH_M = 5.0
 _INTO_M = 1e-3
 """A beam is extended by this, so that its end falls into the cell of the wall, not of the free space before it."""
 _MARGIN = 2
@@ -69,46 +67,17 @@ def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter) -> No
         write_tum(folder / GROUND_TRUTH, *robot.truth)
 
 
-class HasTruePoses(Protocol):
-    """A robot whose true poses are known."""
-
-    @property
-    def stamps(self) -> FloatArray:
-        """Stamps of its scans, shape (N,), seconds."""
-
-    @property
-    def T_building_base(self) -> FloatArray:
-        """True poses at these stamps, shape (N, 3)."""
-
-
-def write_ground_truth(fleet: SimulatedFleet, folder: Path, rng: np.random.Generator) -> None:
-    """Write ``ground_truth/relations``, ``map.pgm`` and ``map.yaml`` into ``folder``.
-
-    True poses are in each robot's recording. The relations measure a map without a common coordinate frame.
+def write_ground_truth(fleet: SimulatedFleet, folder: Path) -> None:
+    """Write the true map, ``ground_truth/map.pgm`` and ``map.yaml``, into ``folder``; true poses are in the recordings.
 
     Raises:
         SimulationError: MuJoCo is missing.
     """
     place = folder / "ground_truth"
     place.mkdir(parents=True, exist_ok=True)
-    write_relations(place / "relations", true_relations(fleet.robots, rng))
     seen = true_map(fleet)
     write_file(place / "map.pgm", pgm_bytes(seen))
     write_file(place / "map.yaml", map_yaml(seen, "map.pgm"))
-
-
-def true_relations(robots: Sequence[HasTruePoses], rng: np.random.Generator, count: int = 2000) -> Relations:
-    """Draw up to ``count`` true relations between scans of any robots, within 5 m and more than 20 s apart."""
-    stamps = np.concatenate([robot.stamps for robot in robots])
-    poses = np.concatenate([robot.T_building_base for robot in robots])
-    first, second = rng.integers(0, len(stamps), (2, 50 * count))
-    near = np.hypot(*(poses[first, :2] - poses[second, :2]).T) < _REACH_M
-    apart = np.abs(stamps[first] - stamps[second]) > ACROSS_ROBOTS_GAP_S
-    chosen = np.flatnonzero(near & apart)[:count]
-    first, second = first[chosen], second[chosen]
-    return Relations(
-        frozen(np.column_stack((stamps[first], stamps[second]))), frozen(se2.between(poses[first], poses[second]))
-    )
 
 
 def true_map(fleet: SimulatedFleet) -> OccupancyMap:

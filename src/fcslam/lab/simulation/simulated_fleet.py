@@ -8,7 +8,7 @@ robot's number. So another robot changes nothing for the others, and cameras cha
 import math
 from collections.abc import Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -17,14 +17,14 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.errors import SimulationError
 from fcslam.lab.simulation.decoration import Decoration, decorate, light_of
-from fcslam.lab.simulation.floorplan import FloorPlan, doors_after, with_closed_doors
+from fcslam.lab.simulation.floorplan import FloorPlan
 from fcslam.lab.simulation.noise import SCANNERS, LidarSettings, simulate_ranges
-from fcslam.lab.simulation.odometry import KINDS, READING_RATE_HZ, OdometryNoiseSettings, Readings, read_odometry
+from fcslam.lab.simulation.odometry import KINDS, READING_RATE_HZ, Readings, read_odometry
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
 from fcslam.lab.simulation.route import TURN_RATE_RAD_S, Schedule, schedule
 from fcslam.lab.simulation.scene import furnished_model
 from fcslam.lab.simulation.sensors import Camera
-from fcslam.lab.simulation.world import IndoorWorld, World
+from fcslam.lab.simulation.world import World
 from fcslam.records import (
     CameraImage,
     CameraModel,
@@ -89,24 +89,11 @@ class SimulationSettings(Settings):
         le=1.0,
         description="share of the furniture in rooms that moves before the second and each further robot",
     )
-    lasting_changes: bool = Field(
-        default=False,
-        description="what moved stays there for later robots, and furniture moves only in rooms that the robot then "
-        "visits, so that every change is seen; else each robot finds the first state changed",
-    )
-    closed_doors: float = Field(
-        default=0.0,
-        ge=0.0,
-        le=1.0,
-        description="share of the doors that a robot drives by, but not through, which are closed",
-    )
     turn_rate_rad_s: float = Field(
         default=TURN_RATE_RAD_S, gt=0.0, le=6.0, description="rate at which the robots turn [rad/s]"
     )
     lidar: LidarSettings = SCANNERS[Scanner.INSTANT]
-    drift: OdometryNoiseSettings | None = Field(
-        default=KINDS[OdometryKind.DEFAULT], description="errors of the wheel odometry; null: robots record no odometry"
-    )
+    odometry: OdometryKind = Field(default=OdometryKind.DEFAULT, description="kind of wheel odometry, or of its fault")
     camera: CameraSettings | None = CameraSettings()
 
 
@@ -225,7 +212,6 @@ class _RandomStream(IntEnum):
     LAMPS = 4
     SCANS = 5
     IMAGES = 6
-    DOORS = 7
 
 
 def _generator(seed: int, purpose: _RandomStream, robot: int = 0, record: int = 0) -> np.random.Generator:
@@ -248,26 +234,16 @@ def simulate_fleet(settings: SimulationSettings, seed: int, world: World | None 
     Raises:
         SimulationError: the building is too small for this many robots, or has too little free space.
     """
-    if settings.closed_doors and settings.camera:
-        raise SimulationError("closed doors are simulated for LiDARs only; leave the cameras off")
-    world = world or IndoorWorld(settings.building)
+    world = world or World(settings.building)
     plan = world.draw(_generator(seed, _RandomStream.BUILDING))
     _check_room(plan, settings)
     goals = world.goals(plan, settings.robots, settings.path_length_m, _generator(seed, _RandomStream.GOALS))
     decoration = decorate(plan, _generator(seed, _RandomStream.LOOKS)) if settings.camera else None
     robots: list[SimulatedRobot] = []
-    left, closed = plan, frozenset[int]()
     for number in range(settings.robots):
         rng = _generator(seed, _RandomStream.ROBOTS, number)
-        visited = goals[number] if settings.lasting_changes else None
-        found = world.changed(left, settings.moved_furniture, rng, visited) if number else plan
-        robot = _robot(world, found, decoration, number, goals[number], settings, seed, rng)
-        if settings.closed_doors:
-            doors_rng, route = _generator(seed, _RandomStream.DOORS, number), robot.T_building_base[:, :2]
-            closed = doors_after(found, closed, settings.closed_doors, route, doors_rng)
-            robot = replace(robot, plan=with_closed_doors(found, closed))
-        robots.append(robot)
-        left = found if settings.lasting_changes else plan
+        found = world.changed(plan, goals[number], settings.moved_furniture, rng) if number else plan
+        robots.append(_robot(world, found, decoration, number, goals[number], settings, seed, rng))
     return SimulatedFleet(plan, tuple(robots))
 
 
@@ -325,11 +301,12 @@ def _readings(
     route: Schedule, times: FloatArray, first_stamp: float, settings: SimulationSettings, rng: np.random.Generator
 ) -> Readings | None:
     """The odometry of a robot that scans at ``times`` (N,)."""
-    if settings.drift is None:
+    errors = KINDS[settings.odometry]
+    if errors is None:
         return None
     if settings.lidar.spin:
         times = np.arange(0.0, times[-1] + 1.0 / settings.lidar.rate_hz + 1.0 / READING_RATE_HZ, 1.0 / READING_RATE_HZ)
-    return read_odometry(np.round(first_stamp + times, 6), route.at(times), settings.drift, rng)
+    return read_odometry(np.round(first_stamp + times, 6), route.at(times), errors, rng)
 
 
 def _jpeg(pixels: FloatArray) -> bytes:

@@ -1,6 +1,5 @@
-"""The world in which a simulated fleet drives: a building, or another one that the caller passes."""
+"""The world in which a simulated fleet drives: plans, routes and beams. Equal generators give equal results."""
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -23,47 +22,32 @@ class Caster(Protocol):
         """Ranges (beam_count,) in metres before noise; ``max_range_m`` without a return."""
 
 
-class World(Protocol):
-    """Plans, routes and beams. Equal generators give equal results."""
+class World:
+    """A building. For another world, override these methods."""
+
+    def __init__(self, building: Building) -> None:
+        self._building = building
 
     def draw(self, rng: np.random.Generator) -> FloorPlan:
         """The plan as the first robot finds it."""
+        return draw_floor_plan(rng, self._building)
 
     def goals(self, plan: FloorPlan, robots: int, length_m: float, rng: np.random.Generator) -> list[FloatArray]:
         """Goals (G, 2) of each robot. Another robot changes nothing for those before it."""
+        return draw_goals(plan, robots, length_m, rng)
 
-    def changed(self, plan: FloorPlan, share: float, rng: np.random.Generator, visited: FloatArray | None) -> FloorPlan:
-        """The plan after a ``share`` of what can move has moved; with ``visited`` (N, 2) only near these positions."""
+    def changed(self, plan: FloorPlan, goals: FloatArray, share: float, rng: np.random.Generator) -> FloorPlan:  # noqa: ARG002
+        """The plan after a ``share`` of the furniture has moved, as a robot with these goals finds it."""
+        return move_furniture(plan, share, rng)
 
     def route(self, plan: FloorPlan, goals: FloatArray, length_m: float, rng: np.random.Generator) -> FloatArray:
         """Waypoints (K, 2) of a path of about ``length_m`` metres."""
-
-    def caster(self, plan: FloorPlan) -> Caster:
-        """The beams of lasers on ``plan``."""
-
-
-@dataclass(frozen=True, slots=True)
-class IndoorWorld:
-    """A building. Its beams need MuJoCo: ``caster`` raises SimulationError without it."""
-
-    building: Building
-
-    def draw(self, rng: np.random.Generator) -> FloorPlan:
-        """See ``World``."""
-        return draw_floor_plan(rng, self.building)
-
-    def goals(self, plan: FloorPlan, robots: int, length_m: float, rng: np.random.Generator) -> list[FloatArray]:
-        """See ``World``."""
-        return draw_goals(plan, robots, length_m, rng)
-
-    def changed(self, plan: FloorPlan, share: float, rng: np.random.Generator, visited: FloatArray | None) -> FloorPlan:
-        """See ``World``."""
-        return move_furniture(plan, share, rng, visited)
-
-    def route(self, plan: FloorPlan, goals: FloatArray, length_m: float, rng: np.random.Generator) -> FloatArray:
-        """See ``World``."""
         return plan_route(plan, goals, length_m, rng)
 
-    def caster(self, plan: FloorPlan) -> RayCaster:
-        """See ``World``."""
+    def caster(self, plan: FloorPlan) -> Caster:
+        """The beams of lasers on ``plan``.
+
+        Raises:
+            SimulationError: MuJoCo is missing.
+        """
         return RayCaster(bare_model(plan))

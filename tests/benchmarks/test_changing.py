@@ -1,0 +1,66 @@
+"""Buildings that change between robots."""
+
+import numpy as np
+import pytest
+from worlds.changing import ChangingBuilding, close_doors, doors_after, doors_of, with_closed_doors
+
+from fcslam.lab.simulation.floorplan import PieceKind, draw_floor_plan
+from fcslam.lab.simulation.noise import LidarSettings
+from fcslam.lab.simulation.options import Building
+from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
+
+pytestmark = pytest.mark.slow
+
+SETTINGS = SimulationSettings(
+    building=Building.FLAT,
+    robots=3,
+    path_length_m=12.0,
+    camera=None,
+    moved_furniture=0.5,
+    lidar=LidarSettings(beams=60),
+)
+
+
+def moved_pieces(before, after):
+    pairs = zip(before.plan.pieces, after.plan.pieces, strict=True)
+    return sum(not np.array_equal(a.outline, b.outline) for a, b in pairs)
+
+
+@pytest.fixture(scope="module")
+def robots():
+    return simulate_fleet(SETTINGS, 1, ChangingBuilding(SETTINGS.building)).robots
+
+
+def test_changes_are_found_by_later_robots(robots):
+    first, second, third = robots
+    assert moved_pieces(first, second) > 0
+    assert moved_pieces(first, third) > moved_pieces(second, third)
+
+
+def test_closed_doors_are_on_no_way(robots):
+    for robot, open_ in zip(close_doors(robots, 1.0), robots, strict=True):
+        closed = robot.plan.pieces[len(open_.plan.pieces) :]
+        assert closed
+        for door in closed:
+            assert np.linalg.norm(robot.T_building_base[:, :2] - door.centre, axis=1).min() > 0.9
+
+
+def test_doors_that_a_robot_drives_through_are_open_and_far_ones_stay_as_they_were():
+    plan = draw_floor_plan(np.random.default_rng(4))
+    doors = doors_of(plan)
+    centres = np.array([door.centre for door in doors])
+    everything = frozenset(range(len(doors)))
+    far = frozenset(np.flatnonzero(np.linalg.norm(centres - centres[0], axis=1) > 4.0).tolist())
+    assert 0 < len(far) < len(doors) - 1
+    through = doors_after(plan, everything, 1.0, centres[:1], np.random.default_rng(0))
+    assert through == everything - {0}
+    assert doors_after(plan, everything, 0.0, centres[:1], np.random.default_rng(0)) == far
+    assert doors_after(plan, frozenset(), 1.0, centres[:1], np.random.default_rng(0)) == everything - far - {0}
+
+
+def test_a_closed_door_is_a_wall():
+    plan = draw_floor_plan(np.random.default_rng(4))
+    closed = with_closed_doors(plan, frozenset({2}))
+    assert len(closed.segments) == len(plan.segments) + 4
+    assert closed.pieces[-1].kind is PieceKind.WALL
+    np.testing.assert_array_equal(closed.pieces[-1].outline, doors_of(plan)[2].outline)
