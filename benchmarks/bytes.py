@@ -30,7 +30,7 @@ from fcslam.mission.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.sources import Source, open_source, split
-from fcslam.wire.ledger import Counter, Ledger
+from fcslam.wire.ledger import Ledger
 from fcslam.wire.messages import UPLINK, Packet, PacketKind
 from fcslam.wire.packets import encode, measure
 
@@ -78,7 +78,7 @@ def fly(sources: list[Source]) -> tuple[Ledger, list[Packet]]:
     """The whole traffic of a mission, and the packets that carried places."""
     config = MissionConfig()
     robots = [RobotFrontend(source.name, config.robot) for source in sources]
-    cloud, traffic = Cloud(config.fleet, config.seed), Counter()
+    cloud, traffic = Cloud(config.fleet, config.seed), Ledger()
     streams = [packets(source, robot) for source, robot in zip(sources, robots, strict=True)]
     places = []
     for packet in heapq.merge(*streams, key=lambda packet: packet.order):
@@ -87,7 +87,7 @@ def fly(sources: list[Source]) -> tuple[Ledger, list[Packet]]:
             traffic.accept(sized.label, sized.size)
         if isinstance(packet.body, Place):
             places.append(packet)
-    return traffic.ledger(), places
+    return traffic, places
 
 
 def packets(source: Source, robot: RobotFrontend) -> Iterator[Packet]:

@@ -25,9 +25,9 @@ from fcslam.lidar.lost import LostConfig
 from fcslam.places.index import PlaceIndex
 from fcslam.places.kmeans_tree import Tree, TreeShape, find_leaves, grow_tree
 from fcslam.places.motions import LARGEST_HAMMING, rigid_hypotheses
-from fcslam.places.similarity import BagOfWords, bag_of_words
+from fcslam.places.similarity import BagOfWords
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
-from fcslam.records import Channel, Codes, FloatArray, Keyscan, Place
+from fcslam.records import Channel, Codes, FloatArray, Keyscan, Place, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
@@ -79,6 +79,20 @@ def brute_force(described: DescribedSet) -> FloatArray:
 def matching_descriptors(a: Codes, b: Codes) -> float:
     """Number of mutual nearest neighbours at most 48 bits apart of descriptors (N, 32) and (M, 32)."""
     return float(len(mutual_matches(a, b, BRUTE_FORCE_BITS).pairs))
+
+
+def bag_of_words(words: NDArray[np.int64], idf: FloatArray, vocabulary_version: int) -> BagOfWords:
+    """Compute the tf-idf vector of a place.
+
+    ``words`` (N,) are those of every descriptor, ``idf`` the inverse document frequency of every word of the
+    vocabulary.
+    """
+    present, counts = np.unique(words, return_counts=True)
+    weights = counts * idf[present]
+    telling = weights > 0.0
+    total = weights[telling].sum()
+    values = weights[telling] / total if total > 0.0 else np.empty(0)
+    return BagOfWords(frozen(present[telling], np.int64), frozen(values), vocabulary_version)
 
 
 class PretrainedVocabulary:

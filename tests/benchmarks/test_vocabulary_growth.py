@@ -14,6 +14,7 @@ from evaluation.vocabulary_growth import (
 )
 
 from fcslam.places.index import PlaceIndex
+from fcslam.places.similarity import similarity
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from tests.benchmarks import place_folders
 
@@ -79,7 +80,7 @@ def test_the_last_words_are_those_of_an_index_that_saw_the_same(world):
     for place in arrivals[:BATCH]:
         index.add(place.name, place.descriptors)
     for g, group in enumerate(groups):
-        expected = [index.similarity(group.target, other) for other in group.others]
+        expected = [similarity(index.bag(group.target), index.bag(other)) for other in group.others]
         np.testing.assert_allclose(growth.similarities[0, g], expected)
         answers = {found.id: found.similarity for found in index.query(group.target, BATCH)}
         np.testing.assert_allclose(growth.asked[g], [answers.get(name, 0.0) for name in group.names])

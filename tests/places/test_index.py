@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from evaluation.place_features import bag_of_words
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fcslam.places.index import PlaceIndex
 from fcslam.places.scoring import NEAR_BITS
-from fcslam.places.similarity import bag_of_words, similarity
+from fcslam.places.similarity import similarity
 from fcslam.places.vocabulary import Scoring, Strategy, TreeConfig, VocabularyConfig
 
 pytestmark = pytest.mark.slow
@@ -187,7 +188,7 @@ def test_excluded_places_make_room_for_the_next(strategy, scoring):
 @EVERY
 def test_before_the_first_training_nothing_is_found(strategy):
     index, places = filled(strategy, count=4)
-    assert (index.query(places[0], 5), index.similarity(places[0], places[0])) == ([], 0.0)
+    assert index.query(places[0], 5) == []
     assert (index.word_count, index.version, index.training, len(index)) == (0, 0, None, 4)
     index.add(4, places[0])
     assert index.query(places[1], 1)[0].id == 1
@@ -200,7 +201,7 @@ def test_eq_4_of_two_places_is_that_of_their_bags(strategy):
     index, places = filled(strategy, Scoring.WORDS)
     expected = words_oracle(index, places, places[2])
     for other in (2, 5, 31):
-        assert index.similarity(places[2], places[other]) == pytest.approx(expected[other], abs=1e-9)
+        assert similarity(index.bag(places[2]), index.bag(places[other])) == pytest.approx(expected[other], abs=1e-9)
 
 
 @EVERY

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
+from evaluation.place_features import bag_of_words
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.places.similarity import PAPER_SCALE, bag_of_words, paper_similarity, similarity
+from fcslam.places.similarity import PAPER_SCALE, paper_similarity, similarity
 
 IDF = np.linspace(0.5, 3.0, 12)
 word_lists = st.lists(st.integers(0, 11), max_size=30).map(lambda words: np.array(words, dtype=np.int64))

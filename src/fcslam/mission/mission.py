@@ -36,7 +36,7 @@ from fcslam.robot.words import Sends
 from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
-from fcslam.wire.ledger import Counter
+from fcslam.wire.ledger import Ledger
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import SizedPacket, measure
 
@@ -160,7 +160,7 @@ class MissionCloud:
         self.config, self._inputs, onto = config, inputs, inputs.onto
         self.host = Cloud(config.fleet, config.seed, inputs.verify_pairs, config.map)
         """The fleet."""
-        self._traffic = Counter()
+        self._traffic = Ledger()
         self._packets: list[StoredPacket] = []
         self._refused = onto.refused
         numbers = itertools.count(len(onto.edits) + 1)
@@ -183,7 +183,7 @@ class MissionCloud:
         """The map so far, as the service shows it live: without new decisions, and of the keyscans alone."""
         result = self.host.fleet.estimate()
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
-        metrics = traffic_metrics(self._traffic.ledger(), tracks)
+        metrics = traffic_metrics(self._traffic, tracks)
         return run_of(
             result, tracks, metrics, dump(self.config), self.config.map, with_local_maps=False, with_certificates=False
         )
@@ -203,7 +203,7 @@ class MissionCloud:
         mapped = {robot.robot for robot in result.robots}
         tracks = unknown | {name: track for name, track in tracks.items() if name in mapped}
         counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
-        metrics = (*counts, *traffic_metrics(self._traffic.ledger(), tracks))
+        metrics = (*counts, *traffic_metrics(self._traffic, tracks))
         mission = mission_bytes(self.config.cloud, self.host.edits, self._packets, self._refused, tracks)
         placing = self._placed(result)
         run = run_of(placing.result, tracks, metrics, dump(self.config), self.config.map)

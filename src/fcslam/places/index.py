@@ -11,7 +11,7 @@ from fcslam.features.codes import CODE_WORDS, CodeWords, code_words
 from fcslam.places.kmeans_tree import TreeShape
 from fcslam.places.postings import GROWTH_FACTOR, Postings
 from fcslam.places.scoring import TINY, empty_buffers, score_matches, score_words
-from fcslam.places.similarity import BagOfWords, similarity
+from fcslam.places.similarity import BagOfWords
 from fcslam.places.vocabulary import Scoring, Strategy, Training, TreeState, Vocabulary, VocabularyConfig
 from fcslam.records import Codes, FloatArray, frozen
 from fcslam.storage.state_file import State
@@ -165,12 +165,6 @@ class PlaceIndex(Generic[PlaceId]):
             leaves, weights = self._weigh(codes)
             rows, scores = score_words(entries, self._buffers, count, leaves, weights)
         return QueryResult(self._ids, rows, scores)
-
-    def similarity(self, a: Codes, b: Codes) -> float:
-        """Eq. (4), scaled to [0, 1], of two places with descriptors (N, 32); 0 before the first training."""
-        if not self._training:
-            return 0.0
-        return similarity(self.bag(a), self.bag(b))
 
     def bag(self, descriptors: Codes) -> BagOfWords:
         """Bag of words of descriptors (N, 32) in the present vocabulary, weighted as stored places are."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.records import FloatArray, frozen
+from fcslam.records import FloatArray
 
 PAPER_SCALE = 4.0
 """``paper_similarity`` of a place with itself; the paper's threshold 0.85 is 0.2125 on the scale of ``similarity``."""
@@ -24,20 +24,6 @@ class BagOfWords:
     values: FloatArray
     """Shape (K,), positive."""
     vocabulary_version: int
-
-
-def bag_of_words(words: NDArray[np.int64], idf: FloatArray, vocabulary_version: int) -> BagOfWords:
-    """Compute the tf-idf vector of a place.
-
-    ``words`` (N,) are those of every descriptor, ``idf`` the inverse document frequency of every word of the
-    vocabulary.
-    """
-    present, counts = np.unique(words, return_counts=True)
-    weights = counts * idf[present]
-    telling = weights > 0.0
-    total = weights[telling].sum()
-    values = weights[telling] / total if total > 0.0 else np.empty(0)
-    return BagOfWords(frozen(present[telling], np.int64), frozen(values), vocabulary_version)
 
 
 def similarity(x: BagOfWords, y: BagOfWords) -> float:

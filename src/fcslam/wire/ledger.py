@@ -1,8 +1,6 @@
 """Traffic between robots and cloud: packets and bytes by robot and kind."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
+from dataclasses import dataclass, field
 
 from fcslam.records import Channel
 from fcslam.wire.messages import UPLINK, PacketKind
@@ -20,14 +18,18 @@ class Traffic:
         return Traffic(self.count + other.count, self.bytes + other.bytes)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Ledger:
-    """The traffic up to one moment."""
+    """The traffic so far."""
 
-    accepted: Mapping[Label, Traffic]
+    accepted: dict[Label, Traffic] = field(default_factory=dict)
     """By robot, kind and, for places, channel; the kind determines the direction."""
-    refused: Traffic
+    refused: Traffic = Traffic()
     """Traffic that was refused; its sender is not known."""
+
+    def accept(self, label: Label, size: int) -> None:
+        """Count a packet of ``size`` bytes that was accepted."""
+        self.accepted[label] = self.accepted.get(label, Traffic()) + Traffic(1, size)
 
     def total(
         self, robot: str | None = None, kind: PacketKind | None = None, channel: Channel | None = None
@@ -47,24 +49,3 @@ class Ledger:
     def downlink(self, robot: str) -> Traffic:
         """Data that the cloud sent to one robot."""
         return sum((self.total(robot, kind) for kind in PacketKind if kind not in UPLINK), Traffic())
-
-
-class Counter:
-    """Counts traffic; ``ledger`` shows it."""
-
-    def __init__(self, before: Ledger | None = None) -> None:
-        """``before`` is the traffic so far; None: no traffic yet."""
-        self._accepted: dict[Label, Traffic] = {} if before is None else dict(before.accepted)
-        self._refused = Traffic() if before is None else before.refused
-
-    def accept(self, label: Label, size: int) -> None:
-        """Count a packet of ``size`` bytes that was accepted."""
-        self._accepted[label] = self._accepted.get(label, Traffic()) + Traffic(1, size)
-
-    def refuse(self, size: int) -> None:
-        """Count ``size`` bytes that were refused."""
-        self._refused += Traffic(1, size)
-
-    def ledger(self) -> Ledger:
-        """The traffic so far; later traffic does not change the result."""
-        return Ledger(MappingProxyType(dict(self._accepted)), self._refused)
