@@ -486,8 +486,6 @@ class ReasonCode(StrEnum):
     RIVAL_PLACES = "rival_has_more_places"
     OUTSIDE_CLUSTER = "outside_dominant_cluster"
     CONTRADICTS_JOINT_GRAPH = "contradicts_joint_graph"
-    PATHS_CONTRADICT = "paths_contradict"
-    SEPARATED = "robot_contradicted"
     FALSE_BRIDGE = "joins_contradicting_maps"
     VETOED = "vetoed"
     PINNED = "pinned"
@@ -521,8 +519,6 @@ _REASON_TEXT = {
     ReasonCode.RIVAL_PLACES: "closures from {value} separate places agree, but others from {limit} contradict them",
     ReasonCode.OUTSIDE_CLUSTER: "outside the dominant cluster",
     ReasonCode.CONTRADICTS_JOINT_GRAPH: "contradicts the joint graph",
-    ReasonCode.PATHS_CONTRADICT: "the paths of the two robots contradict: strain {value}, {limit} allowed",
-    ReasonCode.SEPARATED: "the robot has a map of its own: the paths of {value} others contradict its path",
     ReasonCode.FALSE_BRIDGE: "one robot alone joins maps of which {value} pairs contradict each other",
     ReasonCode.VETOED: "vetoed by hand",
     ReasonCode.PINNED: "pinned by hand",

@@ -164,7 +164,7 @@ def test_the_golden_mission_means_what_it_says():
     assert [kind_of(edit.content) for edit in mission.edits] == ["veto", "cut", "region", "undo"]
     assert {edit.author for edit in mission.edits} == {"boss"}
     # A mission keeps the settings with which it began; the defaults were others then.
-    assert mission.config == CloudConfig(fleet=FleetConfig(contradiction=0.3, submaps_kept=1000))
+    assert mission.config == CloudConfig(fleet=FleetConfig(submaps_kept=1000))
     assert mission.refused == ()
 
 

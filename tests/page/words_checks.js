@@ -23,7 +23,7 @@ console.log(JSON.stringify({
   certificate: need({ quality: { 0: { bar: 0.05, cells: [{ good: true }, { good: false }, { good: false }], drives: [{ text: "drive from (1, 2) to (3, 4) again: about 2 m2 more are good then", from: [1, 2], to: [3, 4] }] }, 1: { bar: 0.05, cells: [{ good: false }], drives: [] } } }).map((n) => [n.text, n.help, n.do]),
   accuracy: [{ quality: { 0: { bar: 0.05, cells: [1, 1, 0].map((good) => ({ good })) }, 1: { bar: 0.05, cells: [{ good: 1 }] } }, readOnly: true }, { quality: {}, readOnly: true }, { quality: {}, readOnly: false, maps: [0] }].map(accuracy),
   late: need({ counts: { ...counts, applied: 2, map_age_s: 100 } }).map((n) => n.text),
-  contradiction: need({ contradicted: [{ ...closure, reason: "robot_contradicted", explanation: "why" }] }).map((n) => [n.text, n.do]),
+  contradiction: need({ contradicted: [{ ...closure, reason: "maps_contradict", explanation: "why" }] }).map((n) => [n.text, n.do]),
   sensors: ["lidar", "camera", "tag"].map((channel) => sensorOf({ channel })),
   times: [duration(8), duration(59.6), duration(119), duration(7200), duration(90000), duration(260000), moment(1077.5, 1000), moment(1077.5, 1000, true)],
   history: history({ robots: [a, b], accepted: [closure], edits: [{ author: "anna", time_s: 1e9, kind: "region", content: { use: "free", name: "" } }] }).map((e) => [e.time, e.text]),

@@ -153,7 +153,6 @@ class ClosureDecisions:
             self._graph,
             self.closures,
             self._config.consistency,
-            self._config.contradiction,
             partial(self._comparison.fit, growth=1.0) if final else self._comparison.fit,
             self._comparison.at,
         )
@@ -303,7 +302,6 @@ class ClosureDecisions:
 
     def _optimize(self) -> None:
         self._graph.optimize()
-        self._contested |= self._graph.is_strained(self._config.contradiction)
         self._contested |= any(map(self._is_refuted, self.joins))
         self.version += 1
 

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from fcslam.cloud.stage_times import StageTimes
 from fcslam.geometry import se2
-from fcslam.graph.contradiction import strained_pairs
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, EdgeArrays, PoseGraph
@@ -134,13 +133,6 @@ class JointGraph:
             solved = np.isin(component, component[np.concatenate((edges.i[changed], edges.j[changed]))])
             solution = optimize(self.graph, start, loss=Loss.CAUCHY, kept=kept, factors=self._factors, solved=solved)
             self.take(solution.poses)
-
-    def is_strained(self, limit: float) -> bool:
-        """Whether closures between two robots, or the path of one, are strained by more than the limit."""
-        owner = np.zeros(len(self.graph), np.int64)
-        for number, variables in enumerate(self._variables.values()):
-            owner[variables.values] = number
-        return bool(strained_pairs(self.graph, owner, self._poses.values, self._kept(), limit))
 
     def take(self, poses: FloatArray) -> None:
         """Replace the estimate by a solution, shape (N, 3)."""

@@ -27,7 +27,6 @@ def reevaluate(
     graph: JointGraph,
     closures: ClosureLog,
     settings: ConsistencySettings,
-    contradiction: float,
     examine: ExamineSessions,
     compare: CompareSessions,
 ) -> Fusion:
@@ -50,7 +49,6 @@ def reevaluate(
         _evidence(graph, entries),
         settings,
         examine=examine_pair,
-        contradiction=contradiction,
         compare=compare_pair,
     )
     graph.take(solution.poses)

@@ -45,13 +45,6 @@ class FleetConfig(Settings):
         gt=1,
         description="number of submaps in the cache, 0.05 MB each; those beyond it are rebuilt from their keyscans",
     )
-    contradiction: float = Field(
-        default=0.15,
-        gt=0,
-        description="strain above which one of the robots of a map contradicts the others: the chi-square that "
-        "closures between two robots, or the measurements of one, share with their neighbours along the path. It is "
-        "mostly below 0.03, and up to 0.08 for a noisy scanner of short range",
-    )
     starts: dict[str, tuple[float, float, float]] = Field(
         default={},
         description="where robots started, by their names: x and y [m] and theta [rad], in one frame. Closures that "

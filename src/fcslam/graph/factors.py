@@ -12,9 +12,6 @@ from fcslam.graph.chains import Chains
 from fcslam.graph.pose_graph import PoseGraph, anchors
 from fcslam.records import FloatArray
 
-HUBER_WIDTH = 1.345
-"""Width of the Huber loss in standard deviations: 95 % efficiency on normal residuals."""
-
 CAUCHY_WIDTH = 2.385
 """Width of the Cauchy loss in standard deviations: 95 % efficiency on normal residuals."""
 
@@ -23,13 +20,10 @@ class Loss(StrEnum):
     """Loss of the residual of a closure; odometry always has the squared loss."""
 
     SQUARED = "squared"
-    HUBER = "huber"
     CAUCHY = "cauchy"
 
     def weights(self, chi2: FloatArray) -> FloatArray:
         """Weights in [0, 1], shape (K,), of residuals with squared Mahalanobis lengths ``chi2``, shape (K,)."""
-        if self is Loss.HUBER:
-            return HUBER_WIDTH / np.maximum(np.sqrt(chi2), HUBER_WIDTH)
         if self is Loss.CAUCHY:
             return CAUCHY_WIDTH**2 / (CAUCHY_WIDTH**2 + chi2)
         return np.ones_like(chi2)
@@ -201,10 +195,7 @@ def _gaussian(root: FloatArray) -> Any:
 def _under(loss: Loss, noise: Any) -> Any:
     if loss is Loss.SQUARED:
         return noise
-    estimators = gtsam.noiseModel.mEstimator
-    huber = loss is Loss.HUBER
-    estimator = estimators.Huber.Create(HUBER_WIDTH) if huber else estimators.Cauchy.Create(CAUCHY_WIDTH)
-    return gtsam.noiseModel.Robust.Create(estimator, noise)
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_WIDTH), noise)
 
 
 def _roots(information: FloatArray) -> FloatArray:

@@ -24,7 +24,6 @@ from fcslam.graph.cluster import (
     relative_frame,
 )
 from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
-from fcslam.graph.contradiction import Strains, contradicting_robots
 from fcslam.graph.evidence import MapFit, shortfall
 from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize
@@ -109,7 +108,7 @@ class JointSolution:
     own: tuple[FloatArray, ...]
     """Poses of each robot from its own measurements alone, shape (N_k, 3); the first stays where the graph has it."""
     apart: Mapping[tuple[int, int], Reason]
-    """Pairs of robots a < b that closures would join, and that stay apart because paths contradict each other."""
+    """Pairs of robots a < b that closures would join, and that stay apart because maps contradict each other."""
 
 
 def not_examined(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members: Closures) -> None:
@@ -125,7 +124,6 @@ def solve_jointly(
     evidence: JointEvidence,
     consistency: ConsistencySettings,
     examine: ExaminePair = not_examined,
-    contradiction: float = np.inf,
     compare: CompareJointMaps = not_compared,
 ) -> JointSolution:
     """Find poses, maps and inlier closures from the evidence alone; no earlier estimate plays a part.
@@ -134,14 +132,12 @@ def solve_jointly(
 
     - a third of its cluster turns out as outliers in the joint solution;
     - the remaining members would not be enough to join two maps;
-    - one of its robots contradicts others;
     - it joins maps that contradict each other.
 
     Args:
         evidence: graph of N variables and E edges, with the role of every edge.
         consistency: when closures are consistent, and what a cluster needs.
         examine: compares the maps of two robots at the transform of a cluster with enough closures.
-        contradiction: strain above which one of the robots of a map contradicts the others.
         compare: called for robots of one map that only one other sender connects.
 
     Returns:
@@ -175,17 +171,10 @@ def solve_jointly(
         confirmed = [
             link for link in joining if _is_confirmed(link, paths, solution, evidence.informative, consistency)
         ]
-        # 7. Robots that contradict others get maps of their own.
-        _, bound = _merge_frames(len(own), known, ())
-        owner = np.array(bound)[_owners(evidence)[0]]
-        # Sightings of one tag share their errors, which are no strain of the paths.
-        counting = (solution.weights > INLIER_WEIGHT) & (True if evidence.tags is None else evidence.tags == 0)
-        left = contradicting_robots(factors, owner, solution.poses, counting, contradiction)
-        apart |= _separations(left, joining, bound, contradiction)
-        confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
-        # 8. Robots that alone join maps that contradict each other leave them.
+        # 7. Robots that alone join maps that contradict each other leave them.
         if len(confirmed) == len(joining):
             bridges = _false_bridges(evidence, solution, senders, compare)
+            _, bound = _merge_frames(len(own), known, ())
             apart |= {(a, b): reason for (a, b), reason in bridges.items() if bound[a] != bound[b]}
             confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         if len(confirmed) == len(joining):
@@ -398,27 +387,6 @@ def _is_confirmed(
     found = evidence_of(positions, informative[link.edges[members]], closures.shared_tags(), settings.separation_m)
     remaining = replace(found, fit=link.decision.evidence.fit)
     return 3 * len(members) > 2 * len(link.members) and shortfall(remaining, settings) is None
-
-
-def _separations(
-    left: Mapping[int, Strains], joining: Sequence[Link], bound: Sequence[int], limit: float
-) -> dict[tuple[int, int], Reason]:
-    """Pairs of robots that must not share a map: those that contradict each other, and links to robots that stay.
-
-    ``left`` has groups of robots that are known to share a map; ``bound`` is each robot's group.
-    """
-    strains = {pair: mean for found in left.values() for pair, mean in found.items()}
-    alone = {
-        (link.a, link.b): Reason(ReasonCode.SEPARATED, max(len(left.get(bound[k], ())) for k in (link.a, link.b)))
-        for link in joining
-        if len(left.keys() & {bound[link.a], bound[link.b]}) == 1
-    }
-    contradicting = {
-        (a, b): Reason(ReasonCode.PATHS_CONTRADICT, strains[pair], limit, "fleet.contradiction")
-        for a, b in itertools.combinations(range(len(bound)), 2)
-        if (pair := (min(bound[a], bound[b]), max(bound[a], bound[b]))) in strains
-    }
-    return alone | contradicting
 
 
 def _false_bridges(

@@ -20,8 +20,6 @@ _GATES = (
 """Tests of verification in their order: a candidate that fails a later one came closer."""
 _FINAL = (
     ReasonCode.MAPS_CONTRADICT,
-    ReasonCode.PATHS_CONTRADICT,
-    ReasonCode.SEPARATED,
     ReasonCode.FALSE_BRIDGE,
     ReasonCode.VETOED,
 )

@@ -7,7 +7,7 @@ const LOW_DISK_BYTES = 2e9;
 const LOOK_ALIKE = 0.5; // maps that fit so well elsewhere, as a share, may show places that only look alike
 const MOST_JOINS = 3; // that the card of a robot names
 const LATE_S = 30; // a map that is older while news wait is late
-const CONTRADICTIONS = ["robot_contradicted", "paths_contradict", "joins_contradicting_maps", "maps_contradict"];
+const CONTRADICTIONS = ["joins_contradicting_maps", "maps_contradict"];
 
 export function duration(seconds) {
   const units = [["s", 60], ["min", 60], ["h", 24]];
