@@ -140,7 +140,6 @@ class LivePlanner:
             self._has_odometry = True
 
     def _is_heard(self, is_late: bool) -> bool:
-        """Whether there are scans of every laser, and odometry."""
         for topic, scans in zip(self._topics.scans, self._first, strict=True):
             if not scans and is_late:
                 silent = f"waits for scans: none that can be read arrived on {topic} within {PATIENCE_S:.0f} s"

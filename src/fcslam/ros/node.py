@@ -328,7 +328,6 @@ class RobotNode:
             )
 
     def _ask(self, command: Callable[[], Answer]) -> Future[Answer]:
-        """Obey a command later."""
         asked: Future[Answer] = Future()
         try:
             self._commands.put_nowait((command, asked))

@@ -291,7 +291,6 @@ class Outputs:
         self._send(topic, DIAGNOSTICS, self._codec.make(DIAGNOSTICS, header=header, status=statuses))
 
     def _begin(self, topic: str, kind: str, quality: Quality) -> None:
-        """Begin to publish a topic, once."""
         if topic not in self._publishers:
             self._publishers[topic] = self._network.publisher(resolved(self._namespace, topic), kind, quality)
 

@@ -84,7 +84,6 @@ class Ros2Network:
             return list(self._known.values())
 
     def _see(self, publishes: bool, sample: Any) -> None:
-        """A publisher or a subscription appeared, changed or went."""
         topic, kind = _TOPIC.fullmatch(sample.topic_name or ""), kind_of(sample.type_name or "")
         is_alive = sample.sample_info.instance_state == self._alive
         if not is_alive or topic is None or kind is None:

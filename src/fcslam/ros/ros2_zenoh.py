@@ -169,7 +169,6 @@ class ZenohNetwork:
         self._declared.append(declared)
 
     def _show(self, kind: str, topic: str, dds_kind: str, type_hash: str, quality: Quality) -> bytes:
-        """Declare an endpoint; returns its identity."""
         words = (topic.replace("/", "%"), dds_kind, type_hash, quality_text(quality))
         token = "/".join((self._token(next(self._numbers), kind), *words))
         self._declare(self._session.liveliness().declare_token(token))
@@ -183,7 +182,6 @@ class ZenohNetwork:
         return self._codec.store.hash_rihs01(full_name(kind))
 
     def _see(self, sample: Any) -> None:
-        """Somebody's token appeared or went."""
         token = str(sample.key_expr)
         found = endpoint_of(token, self._own)
         with self._lock:
@@ -251,7 +249,6 @@ def endpoint_of(token: str, own: str) -> Endpoint | None:
 
 
 def _identity(attached: Any) -> tuple[int, bytes]:
-    """The number of a request and its sender."""
     data = b"" if attached is None else attached.to_bytes()
     if len(data) != struct.calcsize("<qqB16s"):
         return 0, bytes(16)

@@ -180,7 +180,6 @@ class LiveSensors:
         return self._plan is not None and self._topics.odometry is not None and kind == TRANSFORMS
 
     def _fix(self, topic: str, payload: bytes, received_ns: int) -> Iterator[GnssFix]:
-        """The fix in a message, once the mounting is known."""
         if self._plan is None:
             return
         try:

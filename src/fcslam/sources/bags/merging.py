@@ -47,7 +47,6 @@ class ScanMerger:
             yield self._earliest()
 
     def _is_complete(self) -> bool:
-        """Whether there are scans, and one of each laser that is not silent."""
         return any(self._queues) and all(queue or laser in self._silent for laser, queue in enumerate(self._queues))
 
     def _earliest(self) -> tuple[int, ScanMessage]:

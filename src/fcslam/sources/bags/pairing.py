@@ -186,7 +186,6 @@ def _with_pose(waiting: _QueuedItem, readings: deque[OdometryReading]) -> tuple[
 
 
 def _assign_poses(queue: deque[_QueuedItem], previous: OdometryReading | None, newest: OdometryReading) -> None:
-    """Assign poses to the waiting items that a new reading determines."""
     for waiting in queue:
         stamp = waiting.item.stamp
         if waiting.match is not None:
@@ -200,7 +199,6 @@ def _assign_poses(queue: deque[_QueuedItem], previous: OdometryReading | None, n
 
 
 def _insert(readings: deque[OdometryReading], late: OdometryReading) -> None:
-    """Insert a late reading by its stamp."""
     after = [readings.pop()]
     while readings and late.stamp < readings[-1].stamp <= after[-1].stamp:
         after.append(readings.pop())

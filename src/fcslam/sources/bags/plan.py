@@ -223,7 +223,6 @@ class _Planner:
         return None
 
     def _odometry_candidates(self, frame: str) -> Iterator[OdometryInput]:
-        """The chosen topic of odometry, then tf."""
         options = self._options
         link = self._tree.odometry_link(frame, options.odom_frame, options.base_frame)
         measured = self._measured

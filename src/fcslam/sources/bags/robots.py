@@ -42,8 +42,6 @@ class BagRobot(NamedTuple):
 
 @dataclass(slots=True)
 class _Member:
-    """A possible robot."""
-
     space: str
     """Namespace."""
     transforms: tuple[Topic, ...]

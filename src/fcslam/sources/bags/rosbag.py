@@ -423,5 +423,4 @@ def _is_scan(entry: Entry) -> bool:
 
 
 def _in_brackets(errors: Mapping[str, str]) -> str:
-    """The faults of the first invalid message of each topic."""
     return f" ({'; '.join(f'{topic}, {error}' for topic, error in errors.items())})" * bool(errors)

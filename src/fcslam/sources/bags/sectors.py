@@ -128,7 +128,6 @@ def _follows(a: ScanMessage, b: ScanMessage) -> bool:
 
 
 def _is_alike(a: ScanMessage, b: ScanMessage) -> bool:
-    """Whether two scans can be sectors of one laser."""
     increment_rad, other_rad = a.beams.angle_increment_rad, b.beams.angle_increment_rad
     is_sector = all(NARROWEST_RAD < each.beams.span_rad < WIDEST_RAD for each in (a, b))
     return a.frame == b.frame and is_sector and abs(other_rad - increment_rad) <= ROUNDING * increment_rad
@@ -147,5 +146,4 @@ def _turn_beams(beams: Beams) -> int:
 
 
 def _middle_s(sector: ScanMessage) -> float:
-    """When the middle beam is measured."""
     return sector.stamp + (0.0 if sector.sweep is None else 0.5 * (sector.sweep.first_s + sector.sweep.last_s))

@@ -178,7 +178,6 @@ def _scans(known: KnownTopics) -> list[Topic]:
 
 
 def _preferred(scans: Sequence[Topic]) -> list[Topic]:
-    """The laser scans, else the point clouds, else the depth images."""
     kinds = ([topic for topic in scans if topic.type in types] for types in (LASER_SCANS, SCANS, (IMAGE,)))
     return next(filter(None, kinds), [])
 
@@ -188,7 +187,6 @@ def _measured(known: KnownTopics) -> list[Topic]:
 
 
 def _common(candidates: Sequence[Sequence[Topic]]) -> list[Topic]:
-    """Topics that all bags have, with the messages of all of them."""
     names = set.intersection(*({topic.name for topic in own} for own in candidates))
     counts = Counter[str]()
     for topic in chain.from_iterable(candidates):
@@ -249,7 +247,6 @@ def _camera_rank(topic: Topic) -> tuple[int, bool, str]:
 
 
 def _calibration_of(camera: Topic, known: KnownTopics) -> Topic | None:
-    """The calibration topic beside the images, or the only one if there is only one camera."""
     infos = [topic for topic in known.heard if topic.type == CAMERA_INFO]
     only = infos[0] if len(infos) == len(_images(known)) == 1 else None
     return calibration_beside(camera, (*known.own, *known.others)) or only

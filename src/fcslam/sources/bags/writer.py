@@ -181,7 +181,6 @@ class _Bag:
         self._put("/fix", FIX, message)
 
     def _mount(self, stamp_ns: int, frame: str, T_base_frame: Transform) -> None:
-        """Write the mounting of a sensor once."""
         if frame not in self._mounted:
             header = self._codec.header(stamp_ns, _BASE)
             self._put("/tf_static", TRANSFORMS, self._codec.transforms(header, frame, T_base_frame))
