@@ -156,11 +156,7 @@ def select(
 
 
 def relation_errors(relations: Relations, poses: PoseTable) -> RelationErrors:
-    """Compute the errors of ``poses``; a relation is unusable if a stamp has no pose or its poses are in two maps.
-
-    Raises:
-        EvaluationError: no stamp of the relations has a pose.
-    """
+    """Compute the errors of ``poses``; a relation is unusable if a stamp has no pose or its poses are in two maps."""
     row = poses.find(relations.stamps)
     if not np.any(row >= 0):
         raise EvaluationError(
@@ -179,11 +175,7 @@ def motion_errors(T_true: FloatArray, T_estimated: FloatArray) -> tuple[FloatArr
 
 
 def read_relations(path: Path) -> Relations:
-    """Read a relations file, plain, ``.gz`` or ``.xz``.
-
-    Raises:
-        EvaluationError: the file cannot be read, has no relation, or a line is not eight finite numbers.
-    """
+    """Read a relations file, plain, ``.gz`` or ``.xz``."""
     try:
         with open_unpacked(path, by_name=True) as file, io.TextIOWrapper(file, encoding="utf-8") as lines:
             rows = _parse(lines, path)
@@ -196,7 +188,6 @@ def read_relations(path: Path) -> Relations:
 
 
 def _parse(lines: Iterable[str], path: Path) -> list[list[float]]:
-    """Rows of eight numbers; skips blank lines and comments."""
     rows = []
     for number, line in enumerate(lines, start=1):
         fields = line.split()

@@ -41,11 +41,7 @@ class KnownPoses:
 
 
 def truth_folder(run: Path, named: Path | None) -> Path:
-    """Folder with the ground truth of a run: ``named`` if given, else ``recordings`` beside the run, else its parent.
-
-    Raises:
-        EvaluationError: the folder does not exist.
-    """
+    """Folder of the ground truth of a run: ``named`` if given, else ``recordings`` beside the run, else its parent."""
     beside = run.resolve().parent / "recordings"
     folder = named or (beside if beside.is_dir() else run.resolve().parent)
     if not folder.is_dir():
@@ -54,11 +50,7 @@ def truth_folder(run: Path, named: Path | None) -> Path:
 
 
 def known_poses(run: Run, folder: Path) -> KnownPoses:
-    """Interpolate the true poses at the stamps of a run.
-
-    Raises:
-        EvaluationError: the truth of a robot is missing, cannot be read, or does not cover the robot's scans.
-    """
+    """Interpolate the true poses at the stamps of a run."""
     if not run.trajectories:
         raise EvaluationError("the run has no robot, so there is nothing to compare with the truth")
     estimate = pose_table(run)
@@ -75,11 +67,7 @@ def known_poses(run: Run, folder: Path) -> KnownPoses:
 
 
 def read_grid(path: Path) -> LabelledGrid:
-    """Read a map in the format of ROS map_server from its YAML file.
-
-    Raises:
-        EvaluationError: one of the two files is missing or invalid.
-    """
+    """Read a map in the format of ROS map_server from its YAML file."""
     try:
         meta = parse_yaml(read_text(path))
         pixels = decode_grey(read_bytes(path.parent / meta["image"], path.parent))

@@ -25,10 +25,6 @@ def evaluate_relations(
     ``across_robots``: only relations whose stamps belong to different robots. ``parts`` is a run folder that assigns
     stamps to robots, if not ``run``: so a run of one robot is evaluated with the same relations as one of several
     robots from the same recording.
-
-    Raises:
-        EvaluationError: one of them cannot be read, no relation is selected, or none has both its poses in one map of
-            the run.
     """
     reference = read_relations(relations)
     poses = pose_table(open_run(run))
@@ -73,11 +69,7 @@ def relation_metrics(errors: RelationErrors) -> tuple[Metric, ...]:
 
 
 def write_metrics(metrics: tuple[Metric, ...], path: Path) -> None:
-    """Write ``metrics`` as JSON if ``path`` ends in ``.json``, else as CSV with the columns name, value, unit.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write ``metrics`` as JSON if ``path`` ends in ``.json``, else as CSV with the columns name, value, unit."""
     with writing(path, "choose another place"), path.open("w", encoding="utf-8", newline="") as file:
         if path.suffix == ".json":
             file.write(metrics_json(metrics))

@@ -98,11 +98,7 @@ class FleetReport:
 
 
 def evaluate_fleet(run: Path, truth: Path | None = None) -> FleetReport:
-    """Evaluate the run folder ``run`` against the ground truth in a folder, by default that of ``truth_folder``.
-
-    Raises:
-        EvaluationError: the run or a robot's truth is missing or cannot be read, or they are of different recordings.
-    """
+    """Evaluate the run folder ``run`` against the ground truth in a folder, by default that of ``truth_folder``."""
     opened, folder = open_run(run), truth_folder(run, truth)
     known = known_poses(opened, folder)
     alignments = {k: align(*_poses(known, known.estimate.maps == k)) for k in np.unique(known.estimate.maps).tolist()}

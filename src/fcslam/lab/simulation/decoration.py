@@ -87,7 +87,6 @@ def _height_m(piece: Piece, rng: np.random.Generator) -> float:
 
 
 def _pictures(room: Room, rng: np.random.Generator) -> list[WallPicture]:
-    """Pictures on the walls inside a room, and outside beside its door."""
     inward = float(np.sign(room.inside[1] - room.doorway[1]))
     front, back = (room.low[1], room.high[1]) if inward > 0 else (room.high[1], room.low[1])
     (west, _), (east, _) = room.low, room.high

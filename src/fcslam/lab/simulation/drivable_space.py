@@ -43,11 +43,7 @@ class DrivableSpace:
     """Positions of a robot's centre: the largest connected area with enough clearance."""
 
     def __init__(self, plan: FloorPlan) -> None:
-        """Compute the drivable space of ``plan`` with its furniture.
-
-        Raises:
-            SimulationError: the plan has no drivable space.
-        """
+        """Compute the drivable space of ``plan`` with its furniture."""
         self._clearance_m = _CELL_M * distance_transform_edt(~obstacle_cells(plan))
         parts, count = label(self._clearance_m[::_STEP, ::_STEP] >= _CLEARANCE_M, np.ones((3, 3)))
         if not count:
@@ -110,7 +106,6 @@ class DrivableSpace:
 
 
 def _price(clearance_m: FloatArray) -> FloatArray:
-    """Cost of a metre at the given clearances, same shape."""
     tightness = np.clip((_COMFORT_M - clearance_m) / (_COMFORT_M - _CLEARANCE_M), 0.0, 1.0)
     return np.asarray(1.0 + _NARROW * tightness**2)
 

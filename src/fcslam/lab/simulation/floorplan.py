@@ -152,7 +152,6 @@ def _moved(piece: Piece, room: Room, rng: np.random.Generator) -> Piece:
 
 
 def _room_of(piece: Piece, plan: FloorPlan) -> Room | None:
-    """The room of a piece of furniture; None for walls and for furniture in corridors."""
     if piece.kind not in (PieceKind.CABINET, PieceKind.COLUMN):
         return None
     centre = piece.centre
@@ -161,7 +160,6 @@ def _room_of(piece: Piece, plan: FloorPlan) -> Room | None:
 
 
 def _build_row(row: Row, layout: Layout, rng: np.random.Generator) -> tuple[list[Piece], list[Room]]:
-    """Walls and furniture of a row, and its rooms."""
     shares = np.cumsum(np.ones(row.rooms) if layout.alike else rng.uniform(0.75, 1.25, row.rooms))
     edges = row.x[0] + (row.x[1] - row.x[0]) * np.insert(shares / shares[-1], 0, 0.0)
     walls = [_wall(row.x[0], row.back, row.x[1], row.back)]
@@ -185,7 +183,6 @@ def _build_row(row: Row, layout: Layout, rng: np.random.Generator) -> tuple[list
 
 
 def _furniture(room: Room, rng: np.random.Generator) -> list[Piece]:
-    """A few tables, cabinets and columns that leave the entrance free."""
     path = (room.doorway, room.inside)
     pieces = []
     for _ in range(rng.integers(2, 5)):

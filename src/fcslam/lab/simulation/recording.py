@@ -39,11 +39,7 @@ _FRACTION_BITS = 8
 
 
 def prepare_fleet_folder(folder: Path, settings: SimulationSettings, seed: int) -> None:
-    """Make the fleet's folder and write its settings.
-
-    Raises:
-        OutputError: the folder holds something else, or cannot be written.
-    """
+    """Make the fleet's folder and write its settings."""
     text = f"# What fcslam simulated here.\nfcslam: {fcslam.__version__}\nseed: {seed}\n{dump(settings)}"
     with writing(folder, "choose another output folder"):
         folder.mkdir(parents=True, exist_ok=True)
@@ -56,10 +52,6 @@ def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter) -> No
     """Write the robot's recording to ``folder``, a bag of ROS 2, and its true poses to ``GROUND_TRUTH`` in it.
 
     ``watch`` receives the records and passes them on; the recording ends when it ends.
-
-    Raises:
-        SimulationError: MuJoCo or, with a camera, a GL library is missing.
-        OutputError: something is in the way, or cannot be written.
     """
     with closing(robot.records()) as records:
         write_bag(folder, watch(records))
@@ -68,11 +60,7 @@ def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter) -> No
 
 
 def write_ground_truth(fleet: SimulatedFleet, folder: Path) -> None:
-    """Write the true map, ``ground_truth/map.pgm`` and ``map.yaml``, into ``folder``; true poses are in the recordings.
-
-    Raises:
-        SimulationError: MuJoCo is missing.
-    """
+    """Write the true map into ``folder``, ``ground_truth/map.pgm`` and ``map.yaml``; recordings have true poses."""
     place = folder / "ground_truth"
     place.mkdir(parents=True, exist_ok=True)
     seen = true_map(fleet)
@@ -85,9 +73,6 @@ def true_map(fleet: SimulatedFleet) -> OccupancyMap:
 
     The coordinate frame is the building's. A beam that returns nothing leaves its cells unknown. Where furniture moved,
     every surface that a robot saw is occupied.
-
-    Raises:
-        SimulationError: MuJoCo is missing.
     """
     width, height = (int(np.ceil(size / RESOLUTION_M)) + 2 * _MARGIN for size in fleet.plan.size_m)
     passed, hit = (np.zeros((height, width), dtype=np.uint8) for _ in range(2))

@@ -33,9 +33,6 @@ def draw_goals(plan: FloorPlan, robots: int, length_m: float, rng: np.random.Gen
     """Draw goals (G, 2) for each robot: overlapping parts of one walk through rooms and corridors.
 
     Another robot changes nothing for those before it. ``length_m``: path length of each robot.
-
-    Raises:
-        SimulationError: the building has no drivable space, or too little of it.
     """
     space = DrivableSpace(plan)
     spots = _draw_spots(plan, space, rng)
@@ -59,9 +56,6 @@ def plan_route(plan: FloorPlan, goals: FloatArray, length_m: float, rng: np.rand
     """Plan waypoints (K, 2) of a path of ``length_m`` metres that visits goals (G, 2) in a cycle.
 
     The start and the direction are random. Goals that furniture occupies move to the nearest drivable point.
-
-    Raises:
-        SimulationError: the building has no drivable space, or too little of it.
     """
     space = DrivableSpace(plan)
     goals = space.points[[space.nearest(goal) for goal in goals]]
@@ -139,7 +133,6 @@ def _draw_spots(plan: FloorPlan, space: DrivableSpace, rng: np.random.Generator)
 
 
 def _check_spread(points: FloatArray) -> None:
-    """Refuse points (N, 2) that are too close together for a drive."""
     if not len(points) or np.ptp(points, axis=0).max() < _LEAST_SPREAD_M:
         raise SimulationError("the building's free space is too small or too divided to drive in; take a larger one")
 

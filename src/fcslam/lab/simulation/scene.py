@@ -28,11 +28,7 @@ _UPRIGHT = (1, -1, 2, 0, 0, 0)
 
 
 def bare_model(plan: FloorPlan) -> Any:
-    """Model of a building for lasers: walls and furniture without textures.
-
-    Raises:
-        SimulationError: MuJoCo is not installed.
-    """
+    """Model of a building for lasers: walls and furniture without textures."""
     builder = _Builder()
     for _, piece in _standing(plan):
         builder.piece(piece, WALL_HEIGHT_M, "")
@@ -42,11 +38,7 @@ def bare_model(plan: FloorPlan) -> Any:
 def furnished_model(
     plan: FloorPlan, decoration: Decoration, light: Light, image_size: tuple[int, int], fov_y_rad: float
 ) -> Any:
-    """Model of a building for cameras, with one camera called ``CAMERA``.
-
-    Raises:
-        SimulationError: MuJoCo is not installed.
-    """
+    """Model of a building for cameras, with one camera called ``CAMERA``."""
     builder = _Builder()
     builder.view(light, image_size, fov_y_rad)
     for kind, images in (("wall", decoration.walls), ("floor", decoration.floors)):
@@ -93,8 +85,6 @@ def _standing(plan: FloorPlan) -> Iterator[tuple[int, Piece]]:
 
 
 class _Builder:
-    """Builds a MuJoCo specification."""
-
     def __init__(self) -> None:
         self._mujoco = mujoco()
         self._spec = self._mujoco.MjSpec()

@@ -69,11 +69,7 @@ class RayCaster:
 
 
 class Camera:
-    """Renders images of the model's camera; close it, or use it in a ``with``.
-
-    Raises:
-        SimulationError: there is no GL library.
-    """
+    """Renders images of the model's camera; close it, or use it in a ``with``."""
 
     def __init__(self, model: Any, camera: CameraModel, light: Light) -> None:
         self._mujoco = mujoco()

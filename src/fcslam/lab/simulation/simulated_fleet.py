@@ -145,11 +145,7 @@ class SimulatedRobot:
         return stamps, self.route.at(stamps - self.first_stamp)
 
     def records(self) -> Generator[SensorRecord, None, None]:
-        """Scans, images and odometry in the order of time.
-
-        Raises:
-            SimulationError: MuJoCo or, with a camera, a GL library is missing.
-        """
+        """Scans, images and odometry in the order of time."""
         odometry = self.odometry
         stamps = np.concatenate((self.stamps, self.image_stamps, odometry.stamps))
         scans, count, end = self.scans(), len(self.stamps), len(self.stamps) + len(self.image_stamps)
@@ -161,11 +157,7 @@ class SimulatedRobot:
                     yield next(scans) if k < count else next(images)
 
     def scans(self) -> Iterator[LaserScan]:
-        """All scans; every call yields the same.
-
-        Raises:
-            SimulationError: MuJoCo is missing.
-        """
+        """All scans; every call yields the same."""
         caster, settings, (laser,) = self.world.caster(self.plan), self.settings.lidar, self.lasers
         for k in range(len(self.stamps)):
             rng, stamp, poses = self._generator(_RandomStream.SCANS, k), float(self.stamps[k]), self.T_building_base[k]
@@ -230,9 +222,6 @@ def simulate_fleet(settings: SimulationSettings, seed: int, world: World | None 
     """Draw a building and plan the route of each robot; the same seed gives the same fleet.
 
     ``world`` replaces the building of the settings; cameras see buildings only.
-
-    Raises:
-        SimulationError: the building is too small for this many robots, or has too little free space.
     """
     world = world or World(settings.building)
     plan = world.draw(_generator(seed, _RandomStream.BUILDING))
@@ -300,7 +289,6 @@ def _robot(
 def _readings(
     route: Schedule, times: FloatArray, first_stamp: float, settings: SimulationSettings, rng: np.random.Generator
 ) -> Readings | None:
-    """The odometry of a robot that scans at ``times`` (N,)."""
     errors = KINDS[settings.odometry]
     if errors is None:
         return None

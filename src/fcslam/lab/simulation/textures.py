@@ -136,7 +136,6 @@ def door_sign(rng: np.random.Generator, size: int = 64) -> Image:
 
 
 def _books(shelf: FloatArray, rng: np.random.Generator) -> None:
-    """Fill a shelf (H, W, 3) from the left with backs of books."""
     height, width = shelf.shape[:2]
     left = 0
     while left < width - 4:

@@ -45,9 +45,5 @@ class World:
         return plan_route(plan, goals, length_m, rng)
 
     def caster(self, plan: FloorPlan) -> Caster:
-        """The beams of lasers on ``plan``.
-
-        Raises:
-            SimulationError: MuJoCo is missing.
-        """
+        """The beams of lasers on ``plan``."""
         return RayCaster(bare_model(plan))
