@@ -12,11 +12,7 @@ from fcslam.storage.files import write_file
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write a file atomically; its folder is created if it does not exist.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write a file atomically; its folder is created if it does not exist."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)

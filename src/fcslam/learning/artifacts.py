@@ -31,11 +31,7 @@ Curves = dict[str, tuple[list[int], list[float]]]
 def write_training_artifacts(
     network: KeypointNetwork, folder: Path, settings: TrainingSettings, images: TrainingImages, teacher: Path | None
 ) -> list[Path]:
-    """Write `detector.onnx`, `training.png` and `card.md`; returns their paths.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
+    """Write `detector.onnx`, `training.png` and `card.md`; returns their paths."""
     detector, picture, card = (folder / name for name in ("detector.onnx", "training.png", "card.md"))
     export_onnx(network, detector)
     curves = read_curves(folder / "joint" / PROGRESS_FILE, "joint")
@@ -74,11 +70,7 @@ def model_card(
 
 
 def read_curves(path: Path, stage: str) -> Curves:
-    """Curves of a stage from its log; of a step that was repeated, the later values count.
-
-    Raises:
-        TrainingError: the file is not a log of a training run.
-    """
+    """Curves of a stage from its log; of a step that was repeated, the later values count."""
     values: dict[str, dict[int, float]] = {}
     try:
         with path.open(newline="", encoding="utf-8") as file:

@@ -38,11 +38,7 @@ class Checkpoint:
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Replace the checkpoint atomically.
-
-    Raises:
-        OutputError: the file cannot be written, for instance because the disk is full; the last checkpoint stays.
-    """
+    """Replace the checkpoint atomically."""
     header = {
         "format": FORMAT,
         "stage": checkpoint.stage,
@@ -57,11 +53,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint.
-
-    Raises:
-        TrainingError: the file is not a checkpoint, or has another format.
-    """
+    """Read a checkpoint."""
     try:
         arrays = read_arrays(path)
         header = json.loads(str(arrays.pop(_HEADER)))

@@ -71,9 +71,6 @@ def train_codes(
 
     The result depends on the arguments alone. ``inputs`` are kept from call to call. Keypoints, and the codes of
     distorted views, stay as the network ``before`` gives them.
-
-    Raises:
-        TrainingError: nothing was seen again, a state does not fit the network, or training diverged.
     """
     settings, device = plan.settings, plan.device
     if not revisits:

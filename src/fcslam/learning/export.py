@@ -50,11 +50,7 @@ def detector_version(network: KeypointNetwork) -> str:
 
 
 def export_onnx(network: KeypointNetwork, path: Path) -> None:
-    """Write the file, in float32.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write the file, in float32."""
     import onnx
 
     ready = ExportedNetwork(network).cpu().eval()

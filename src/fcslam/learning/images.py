@@ -34,11 +34,7 @@ class ImageFile:
 
 
 def find_images(roots: Sequence[Path]) -> list[ImageFile]:
-    """All image files in the folder trees, sorted by name.
-
-    Raises:
-        TrainingError: a root is not a folder or holds no image, or two roots have the same name and the same files.
-    """
+    """All image files in the folder trees, sorted by name."""
     found: dict[str, ImageFile] = {}
     for root in roots:
         if not root.is_dir():

@@ -68,11 +68,7 @@ def fuse_keypoints(first: Points, second: Points) -> Labels:
 
 
 def read_teacher(path: Path) -> Teacher:
-    """Read a teacher's file, which a script of the user has made (see docs/howto/training.md).
-
-    Raises:
-        TrainingError: the file does not exist, or lacks an array, or the arrays do not fit together.
-    """
+    """Read a teacher's file, which a script of the user has made (see docs/howto/training.md)."""
     try:
         arrays = read_arrays(path)
         keypoints, scores, descriptors = (arrays[name] for name in ("keypoints", "scores", "descriptors"))
@@ -92,11 +88,7 @@ def is_finite(array: NDArray[np.generic]) -> bool:
 
 
 def write_labels(path: Path, labels: Labels, key: int) -> None:
-    """Write labels for later runs; ``key`` identifies the image.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write labels for later runs; ``key`` identifies the image."""
     write_arrays(path, {"keypoints": labels.keypoints, "quality": labels.quality, "key": np.array(key)})
 
 

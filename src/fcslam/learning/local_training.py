@@ -60,9 +60,6 @@ def local_training(
     start: Mapping[str, Tensor], examples: Sequence[TrainingExample], plan: LocalTrainingPlan
 ) -> LocalTrainingResult:
     """Train for some steps from the state ``start``, which is not changed. The result depends on the arguments alone.
-
-    Raises:
-        TrainingError: a state does not fit the network, or training diverged.
     """
     settings, device = plan.settings, plan.device
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
@@ -81,11 +78,7 @@ def local_training(
 def train_layers(
     network: KeypointNetwork, layers: Sequence[nn.Module], losses_of: LossesOf, plan: LocalTrainingPlan
 ) -> LocalTrainingResult:
-    """Train some layers of a network in place, with the batch statistics as they are. All others stay as they are.
-
-    Raises:
-        TrainingError: the optimizer's state belongs to another network, or training diverged.
-    """
+    """Train some layers of a network in place, with the batch statistics as they are. All others stay as they are."""
     trained = layer_names(network, layers)
     for name, parameter in network.named_parameters():
         parameter.requires_grad_(name in trained)
@@ -125,11 +118,7 @@ def layer_names(network: KeypointNetwork, layers: Sequence[nn.Module]) -> set[st
 
 
 def network_from_state(encoder: Encoder, state: Mapping[str, Tensor]) -> KeypointNetwork:
-    """A network in this state, in evaluation mode.
-
-    Raises:
-        TrainingError: the state belongs to another network.
-    """
+    """A network in this state, in evaluation mode."""
     network = KeypointNetwork(encoder)
     try:
         network.load_state_dict(dict(state))

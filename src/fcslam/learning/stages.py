@@ -112,11 +112,6 @@ def train_detector(
 
     Returns:
         The trained network, and the images that it was trained on.
-
-    Raises:
-        TrainingError: there is no usable image, a teacher's file is missing or broken, or ``folder`` belongs to another
-            run.
-        OutputError: a file cannot be written; everything written before stays.
     """
     own = folder.resolve()
     files = [file for file in find_images(roots) if not file.path.resolve().is_relative_to(own)]
@@ -158,10 +153,6 @@ def read_labelled_images(
         teacher: folder of a teacher's files, whose keypoints replace the detector's; None without a teacher.
         on_progress: called after every image.
         most: usable images to train on; reading ends with the last of them. None for all.
-
-    Raises:
-        TrainingError: too few images are usable, or a teacher's file is missing, broken, or of another teacher.
-        OutputError: labels cannot be written.
     """
     train: list[TrainingExample] = []
     held_out: list[TrainingExample] = []
@@ -195,11 +186,7 @@ def read_labelled_images(
 
 
 def _check_usable(files: Sequence[ImageFile]) -> None:
-    """Look before the long work whether there are enough images.
-
-    Raises:
-        TrainingError: there are not.
-    """
+    """Look before the long work whether there are enough images."""
     usable = 0
     for file in files:
         image = read_image(file.path)
@@ -253,10 +240,6 @@ def train_on_shapes(
     """Train a detector of the corners of synthetic shapes; its descriptors are not trained yet.
 
     ``folder`` is for the files of this stage, which is continued if it is in there.
-
-    Raises:
-        TrainingError: ``folder`` belongs to another run.
-        OutputError: a file cannot be written.
     """
     shapes = settings.model_copy(update={"steps": settings.shape_steps})
     run = TrainingRun(shapes, "shapes", folder, options)

@@ -109,10 +109,6 @@ class TrainingRun:
         """Train to the last step; returns the averaged network.
 
         ``bits`` are a teacher's, if the examples have one; ``weights`` replace those that the settings name.
-
-        Raises:
-            TrainingError: the folder's checkpoint belongs to another run, or training diverged.
-            OutputError: the folder cannot be written.
         """
         with writing(self.folder, "choose another output folder"):
             self.folder.mkdir(parents=True, exist_ok=True)

@@ -81,11 +81,7 @@ def step_losses(
 
 
 def descend(network: KeypointNetwork, optimizer: torch.optim.Optimizer, total: Tensor, step: int, rate: float) -> None:
-    """Follow the gradient of a step's sum of losses in place, with this learning rate.
-
-    Raises:
-        TrainingError: the sum is not finite; the step changed nothing.
-    """
+    """Follow the gradient of a step's sum of losses in place, with this learning rate."""
     if not torch.isfinite(total):
         raise TrainingError(f"training diverged at step {step}; lower the learning rate")
     for group in optimizer.param_groups:

@@ -30,9 +30,6 @@ def next_weights(
 
     ``updates`` passed screening; they were trained from ``old``. ``momentum`` is that after the round before; empty at
     first, and after a return to an earlier version.
-
-    Raises:
-        TrainingError: the aggregate is not finite or does not fit the network.
     """
     aggregated = {name: np.asarray(array, np.float32) for name, array in aggregate(round_number, updates).items()}
     reason, following = weights_error(aggregated, old), aggregated

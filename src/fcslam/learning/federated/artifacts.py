@@ -29,10 +29,6 @@ def write_federated_artifacts(
     """Write the detector, the picture and the card; returns their paths.
 
     ``folder`` contains the table of rounds; ``judged_on`` names the images on which versions were evaluated.
-
-    Raises:
-        OutputError: a file cannot be written.
-        TrainingError: the table of rounds is broken.
     """
     network = weights_to_network(state.best, settings.training.encoder)
     export_onnx(network, folder / DETECTOR)

@@ -84,9 +84,6 @@ def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin
     """The state in a checkpoint of this run; None if there is no file.
 
     ``initial`` and ``origin``: the weights that the run starts from, and their detector version.
-
-    Raises:
-        TrainingError: the file is broken, or belongs to a run with other settings, weights or network.
     """
     if not path.exists():
         return None

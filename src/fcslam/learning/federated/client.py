@@ -92,12 +92,7 @@ class RobotClient:
     """Pairs of keyframes that are never trained on."""
 
     def train(self, request: TrainingRequest) -> ClientUpdate:
-        """Train from the weights. The result depends on the request, the cache and the images.
-
-        Raises:
-            TrainingError: there are too few usable images, the weights belong to another network, training diverged,
-                or the cache cannot be used.
-        """
+        """Train from the weights. The result depends on the request, the cache and the images."""
         settings, number, run_id = request.settings, request.round_number, request.run_id
         encoder = settings.training.encoder
         start = weights_to_network(request.weights, encoder).state_dict()

@@ -122,12 +122,7 @@ class Coordinator:
         self._run_id = run_id(settings, self._origin)
 
     def run(self) -> CoordinatorState:
-        """Do all rounds that are not done yet.
-
-        Raises:
-            TrainingError: the folder belongs to another run, or a round cannot be completed and there is no ``wait``.
-            OutputError: a file cannot be written; everything written before stays.
-        """
+        """Do all rounds that are not done yet."""
         state, rows = self._resume()
         if state.best_round > 0:
             self._hooks.on_release(state.best)

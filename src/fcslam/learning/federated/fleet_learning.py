@@ -36,12 +36,7 @@ _log = logging.getLogger("fcslam.learning")
 
 
 def run(data: Path, output: Path, settings: FleetLearningSettings, listener: socket.socket) -> None:
-    """Learn until all rounds are done, and live on.
-
-    Raises:
-        TrainingError: the output folder belongs to other rounds.
-        OutputError: the output folder cannot be written.
-    """
+    """Learn until all rounds are done, and live on."""
 
     def report(done: RoundReport) -> None:
         decision = f"{done.version} is released" if done.released else "not released"

@@ -69,11 +69,7 @@ class RoundReport:
 
 
 def read_rows(path: Path, last: int) -> list[Row]:
-    """Rows up to round ``last``; none if there is no file.
-
-    Raises:
-        TrainingError: the file is not a table of rounds.
-    """
+    """Rows up to round ``last``; none if there is no file."""
     if not path.exists():
         return []
     try:
@@ -84,11 +80,7 @@ def read_rows(path: Path, last: int) -> list[Row]:
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Replace the table atomically; its folder is created if it does not exist.
-
-    Raises:
-        OutputError: the table cannot be written; the old one stays.
-    """
+    """Replace the table atomically; its folder is created if it does not exist."""
     content = io.StringIO()
     names = dict.fromkeys(name for row in rows for name in row)
     writer = csv.DictWriter(content, list(names), restval="", lineterminator="\n")

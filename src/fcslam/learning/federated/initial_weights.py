@@ -37,11 +37,6 @@ def prepare_initial_weights(
     ``folder``, so that other public images later do not change where the run started. ``start`` is a checkpoint, an
     ONNX file, or the name of a network that comes with fcslam; None to train on synthetic shapes. The server may read
     the ``public`` images.
-
-    Raises:
-        TrainingError: ``start`` holds no weights of this network, or ``folder`` belongs to another run or holds a
-            broken file.
-        OutputError: a file cannot be written.
     """
     if start is None:
         return network_to_weights(train_on_shapes(folder / "shapes", settings, options, on_progress))
@@ -63,11 +58,7 @@ def prepare_initial_weights(
 
 
 def read_detector_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]]:
-    """The weights in a checkpoint of federated or central training, or in an exported detector's ONNX file.
-
-    Raises:
-        TrainingError: the file is neither a checkpoint nor a detector, or belongs to another network.
-    """
+    """The weights in a checkpoint of federated or central training, or in an exported detector's ONNX file."""
     if path.suffix == SUFFIX:
         return read_onnx_weights(path, encoder)
     tensors = read_checkpoint(path).tensors

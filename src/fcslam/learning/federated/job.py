@@ -63,10 +63,6 @@ def run_job(
     """Run a job, or continue it; returns the files for the user: detector, picture of the rounds, and model card.
 
     ``wait``: as in ``CoordinatorHooks``.
-
-    Raises:
-        TrainingError: an input is unusable, no robot can train, or the output folder belongs to another run.
-        OutputError: a file cannot be written.
     """
     images = read_public_images(job.public)
     _write_config(job, job.output / CONFIG_FILE)
@@ -111,11 +107,6 @@ def federate_locally(
 
     ``folders`` hold the images of each robot, which has the name of its folder. It trains on its first ``most_images``
     alone; None for all.
-
-    Raises:
-        TrainingError: two folders have the same name, a folder is unusable, no robot can train, or the output folder
-            belongs to another run.
-        OutputError: a file cannot be written.
     """
     names = [folder.resolve().name for folder in folders]
     twice = {name for name in names if names.count(name) > 1}

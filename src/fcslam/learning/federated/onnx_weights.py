@@ -29,9 +29,6 @@ def read_onnx_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.floa
 
     The export folded each batch normalisation into the convolution before it. Read back, the normalisation only holds
     the shift, so the network computes the same function. Before training, call ``with_batch_statistics``.
-
-    Raises:
-        TrainingError: the file is not a detector in float32, or has another encoder.
     """
     import onnx
 

@@ -23,11 +23,7 @@ STATISTICS_IMAGES: Final = 64
 
 
 def read_public_images(roots: Sequence[Path]) -> list[GreyImage]:
-    """Usable images below the folders; none without folders.
-
-    Raises:
-        TrainingError: a folder does not exist, or holds no usable image.
-    """
+    """Usable images below the folders; none without folders."""
     if not roots:
         return []
     images = [image for file in find_images(roots) if (image := read_image(file.path)) is not None]
