@@ -11,7 +11,6 @@ from tests.learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import OutputError, TrainingError  # noqa: E402
-from fcslam.learning.artifacts import read_curves  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
 from fcslam.learning.labels import Teacher, fuse_keypoints  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
@@ -23,6 +22,7 @@ from fcslam.learning.trainer import (  # noqa: E402
     PROGRESS_FILE,
     ExecutionOptions,
     TrainingRun,
+    read_curves,
 )
 from fcslam.learning.training_step import learning_rate, reduced_precision  # noqa: E402
 from fcslam.learning.validation import collapse_warnings, validate, validation_pairs  # noqa: E402

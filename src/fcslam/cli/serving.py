@@ -19,7 +19,8 @@ from fcslam.cli.training_options import LEARNING_FILE, require_training_librarie
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import load
 from fcslam.errors import FcslamError, ServiceError
-from fcslam.learning.federated.settings import DETECTOR, RELEASE, FleetLearningSettings
+from fcslam.learning.federated.settings import RELEASE, FleetLearningSettings
+from fcslam.learning.settings import DETECTOR
 from fcslam.processes import Child, module_command
 from fcslam.service.audit_log import AuditFile
 from fcslam.service.http.authentication import Authenticator, read_tokens

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 QUICK = {"steps": 20, "shape_steps": 20, "pairs": 2, "side_px": 96, "label_copies": 2}
 """Settings of ``--quick``: every stage runs, none long enough to learn much."""
-FIGURES = ("repeatability", "mma_3px", "shift_repeatability")
+FIGURES = ("repeatability", "mma_3px")
 
 
 def train(
@@ -48,8 +48,8 @@ def train(
 
     settings = chosen_settings(TrainingSettings().model_copy(update=QUICK if quick else {}), config)
     require_training_libraries()
-    from fcslam.learning.artifacts import write_training_artifacts
-    from fcslam.learning.stages import train_detector
+    from fcslam.learning.artifacts import write_artifacts
+    from fcslam.learning.stages import train_detector, training_report
 
     console = notices()
     output = output or new_folder(TRAINING)
@@ -66,7 +66,7 @@ def train(
             QUICK_IMAGES if quick else None,
             None if start is None else _start_network(start, output, settings, options, images),
         )
-    files = write_training_artifacts(network, output, settings, found, teacher)
+    files = write_artifacts(network, output, "training.png", settings, training_report(output, found, teacher))
     for file in files:
         typer.echo(str(file))
     held_out = len(found.held_out) if found.are_held_out else 0

@@ -59,7 +59,9 @@ class LocalTrainingResult(NamedTuple):
 def local_training(
     start: Mapping[str, Tensor], examples: Sequence[TrainingExample], plan: LocalTrainingPlan
 ) -> LocalTrainingResult:
-    """Train for some steps from the state ``start``, which is not changed. The result depends on the arguments alone.
+    """Train for some steps from the state ``start``, which is not changed.
+
+    The result depends on the arguments alone.
     """
     settings, device = plan.settings, plan.device
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)

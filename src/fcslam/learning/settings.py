@@ -1,10 +1,13 @@
 """Settings of the training of a detector."""
 
-from typing import Literal
+from typing import Final, Literal
 
 from pydantic import Field
 
 from fcslam.config import Settings
+
+DETECTOR: Final = "detector.onnx"
+"""File of the trained detector in the output folder."""
 
 Encoder = Literal["light", "vgg"]
 Losses = Literal["default", "paper"]

@@ -18,6 +18,7 @@ import torch
 from fcslam.errors import TrainingError, writing
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
+from fcslam.learning.artifacts import Curve, Panel, TrainingReport
 from fcslam.learning.export import detector_version
 from fcslam.learning.homographic_adaptation import Response, adapt, harris, peaks
 from fcslam.learning.images import ImageFile, find_images, is_held_out, is_usable, read_image
@@ -27,7 +28,7 @@ from fcslam.learning.objective import LossWeights, TeacherBits, teacher_bits
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.synthetic_shapes import draw_shapes
-from fcslam.learning.trainer import ExecutionOptions, TrainingProgress, TrainingRun
+from fcslam.learning.trainer import PROGRESS_FILE, ExecutionOptions, TrainingProgress, TrainingRun, read_curves
 
 LABEL_NMS_PX: Final = 4.0
 DESCRIPTORS_OF_AN_IMAGE: Final = 32
@@ -273,3 +274,37 @@ def keypoint_response(network: KeypointNetwork, device: torch.device) -> Callabl
 
     response_of: Callable[[GreyImage], Response] = detector
     return response_of
+
+
+SHOWN_METRICS: Final = {
+    "repeatability": "keypoints found again within 3 px",
+    "mma_3px": "matches within 3 px, by bits",
+    "bit_bias": "distance of a bit's mean from a half",
+    "code_spread_bits": "bits between codes of different points",
+}
+
+
+def training_report(folder: Path, images: TrainingImages, teacher: Path | None) -> TrainingReport:
+    """The report of a run in a folder, for its card and picture."""
+    curves = read_curves(folder / "joint" / PROGRESS_FILE, "joint")
+    held_out = f"{len(images.held_out)} others were held out" if images.are_held_out else "none was held out"
+    facts = [
+        f"Trained on {len(images.train)} images; {held_out}, {images.skipped} left out.",
+        f"Teacher: {'none' if teacher is None else f'keypoints and descriptors in {teacher.name}'}.",
+    ]
+    judged = "held-out images" if images.are_held_out else "an image that was trained on"
+
+    def shown(*names: str) -> dict[str, Curve]:
+        return {name.replace("_", " "): curves[name] for name in names if name in curves}
+
+    return TrainingReport(
+        facts,
+        f"on pairs of views of {judged}, 320 x 240, warped and lit at random",
+        {text: curves[name][1][-1] for name, text in SHOWN_METRICS.items() if name in curves},
+        [
+            Panel("losses", shown("detector", "contrastive", "triplet", "distillation")),
+            Panel("on held-out images", shown("repeatability", "mma_3px"), are_shares=True),
+            Panel("bits between codes of different points", shown("code_spread_bits")),
+        ],
+        "step",
+    )

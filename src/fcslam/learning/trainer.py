@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from fcslam.errors import TrainingError, writing
+from fcslam.learning.artifacts import Curve
 from fcslam.learning.batches import batch_stream
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from fcslam.learning.network import KeypointNetwork
@@ -191,3 +192,16 @@ class TrainingRun:
             if not file.tell():
                 rows.writerow(("stage", "step", "name", "value"))
             rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in metrics.items())
+
+
+def read_curves(path: Path, stage: str) -> dict[str, Curve]:
+    """Curves of a stage from its log; of a step that was repeated, the later values count."""
+    values: dict[str, dict[int, float]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                if row["stage"] == stage:
+                    values.setdefault(row["name"], {})[int(row["step"])] = float(row["value"])
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise TrainingError(f"{path}: is not a log of a training run ({error})") from error
+    return {name: (sorted(points), [points[step] for step in sorted(points)]) for name, points in values.items()}

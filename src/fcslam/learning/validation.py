@@ -5,7 +5,6 @@ from typing import Final
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from fcslam.features.codes import CODE_BITS, hamming_matrix, mutual_matches
@@ -20,7 +19,6 @@ from fcslam.learning.homography import (
 )
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
-from fcslam.learning.warps import well_inside
 from fcslam.records import Codes, FloatArray
 
 VALIDATION_PAIRS: Final = 24
@@ -32,11 +30,7 @@ VALIDATION_SEED: Final = 2026
 NMS_PX: Final = 4.0
 LEAST_SCORE: Final = 0.001
 """Probability below which a pixel is not a keypoint."""
-ROLLED_RIM_PX: Final = 12.0
-"""Points closer to the border than this are affected by the pixels that were rolled in."""
 MOST_POINTS: Final = 300
-SHIFTS: Final = ((1, 0), (0, 2), (3, 3), (4, 1), (5, 0), (2, 6), (7, 7))
-"""Rows and columns of the shifts, within a cell of 8 x 8 pixels."""
 LEAST_SPREAD_BITS: Final = 0.3 * CODE_BITS
 """Codes of different points that differ in fewer bits on average are collapsing; chance gives a half of all bits."""
 LARGEST_BIAS: Final = 0.25
@@ -62,24 +56,16 @@ def detect(network: KeypointNetwork, image: Tensor) -> tuple[FloatArray, Codes]:
     return points.astype(np.float64), sample_codes(maps.code_logits[0].cpu().numpy(), points)
 
 
-def validate(
-    network: KeypointNetwork, pairs: Sequence[ViewPair], device: torch.device, shifts: bool = True
-) -> dict[str, float]:
-    """Metrics of a network, means over the pairs.
-
-    Args:
-        network: to validate.
-        pairs: views of images that the network was not trained on.
-        device: of the network.
-        shifts: also measure repeatability after shifts, which takes four times as long as all other metrics.
+def validate(network: KeypointNetwork, pairs: Sequence[ViewPair], device: torch.device) -> dict[str, float]:
+    """Metrics of a network, means over pairs of views of images that it was not trained on.
 
     Returns:
-        ``repeatability``, ``mma_3px`` and ``shift_repeatability`` in [0, 1]; ``bit_bias``, the mean distance of a bit's
-        mean from a half, in [0, 0.5]; ``code_spread_bits``, the mean distance between codes in a view [bits].
+        ``repeatability`` and ``mma_3px`` in [0, 1]; ``bit_bias``, the mean distance of a bit's mean from a half, in
+        [0, 0.5]; ``code_spread_bits``, the mean distance between codes in a view [bits].
     """
     training = network.training
     network.eval()
-    rows = [_validate_pair(network, pair, device, shifts) for pair in pairs]
+    rows = [_validate_pair(network, pair, device) for pair in pairs]
     network.train(training)
     return {name: _mean([row[name] for row in rows]) for name in rows[0]}
 
@@ -94,22 +80,7 @@ def collapse_warnings(figures: dict[str, float]) -> list[str]:
     return found
 
 
-def shift_repeatability(network: KeypointNetwork, image: Tensor) -> float:
-    """Share of the strongest points found again within 1 px after rolling the image by 1 to 7 px; NaN without any."""
-    points, _ = detect(network, image)
-    size = (image.shape[-1], image.shape[-2])
-    shares = []
-    for row, column in SHIFTS:
-        rolled, _ = detect(network, image.roll((row, column), (-2, -1)))
-        expected = points + np.array([column, row])
-        kept = expected[well_inside(expected, size, ROLLED_RIM_PX)]
-        if len(kept):
-            distances = np.asarray(KDTree(rolled).query(kept)[0]) if len(rolled) else np.full(len(kept), np.inf)
-            shares.append(float(np.mean(distances <= 1.0)))
-    return _mean(shares)
-
-
-def _validate_pair(network: KeypointNetwork, pair: ViewPair, device: torch.device, shifts: bool) -> dict[str, float]:
+def _validate_pair(network: KeypointNetwork, pair: ViewPair, device: torch.device) -> dict[str, float]:
     images = [torch.from_numpy(view.image)[None, None].to(device) for view in pair.views]
     (first, first_codes), (second, second_codes) = (detect(network, image) for image in images)
     size = (images[0].shape[-1], images[0].shape[-2])
@@ -121,7 +92,6 @@ def _validate_pair(network: KeypointNetwork, pair: ViewPair, device: torch.devic
     return {
         "repeatability": repeatability(first, second, pair.homography, size, MOST_POINTS).repeatability,
         "mma_3px": float(matching_accuracy(errors, [CORRECT_PX])[0]),
-        **({"shift_repeatability": shift_repeatability(network, images[0])} if shifts else {}),
         "bit_bias": float(np.abs(bits.mean(axis=0) - 0.5).mean()) if len(first) else np.nan,
         "code_spread_bits": float(hamming_matrix(first_codes, first_codes).sum()) / pairs if pairs else np.nan,
     }

@@ -117,7 +117,7 @@ class RobotClient:
         """Repeatability and MMA at 3 px of the weights, shares in [0, 1], on pairs of images that are held out."""
         network = weights_to_network(request.weights, request.settings.training.encoder).to(self.device)
         pairs = validation_pairs(self._labelled_images(request).held_out)
-        found = validate(network, pairs, torch.device(self.device), shifts=False)
+        found = validate(network, pairs, torch.device(self.device))
         # A detector that finds nothing has no metrics; it counts as one that finds nothing again.
         return {name: found[name] if np.isfinite(found[name]) else 0.0 for name in SCORE_METRICS}
 

@@ -8,8 +8,8 @@ from typing import Final
 
 from fcslam.config import dump
 from fcslam.errors import TrainingError, writing
+from fcslam.learning.artifacts import write_artifacts
 from fcslam.learning.export import export_onnx
-from fcslam.learning.federated.artifacts import write_federated_artifacts
 from fcslam.learning.federated.client import RobotClient
 from fcslam.learning.federated.coordinator import RULES, Coordinator, CoordinatorHooks, RoundRules
 from fcslam.learning.federated.fleets import InProcessFleet, TrainingFleet
@@ -17,8 +17,10 @@ from fcslam.learning.federated.history import RoundReport
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.networks import weights_to_network, weights_version
 from fcslam.learning.federated.public_images import public_evaluation, read_public_images
-from fcslam.learning.federated.settings import DETECTOR, FederatedSettings
+from fcslam.learning.federated.report import federated_report
+from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights
+from fcslam.learning.settings import DETECTOR
 from fcslam.learning.stages import StageCallback
 from fcslam.learning.trainer import ExecutionOptions
 
@@ -85,7 +87,9 @@ def run_job(
     )
     if job.rules.lesson == "revisits":
         judged_on = "on revisits that no robot trained on, mean"
-    return write_federated_artifacts(state, job.output, job.settings, judged_on)
+    network = weights_to_network(state.best, encoder)
+    report = federated_report(state, job.output, judged_on)
+    return write_artifacts(network, job.output, "rounds.png", job.settings, report)
 
 
 def _write_config(job: FederatedJob, path: Path, again: bool = False) -> None:

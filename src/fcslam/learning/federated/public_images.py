@@ -41,7 +41,7 @@ def public_evaluation(images: Sequence[GreyImage], encoder: Encoder, device: str
     pairs = validation_pairs([TrainingExample(image, unlabelled) for image in images])
 
     def evaluate(weights: Weights) -> Metrics:
-        return validate(weights_to_network(weights, encoder).to(device), pairs, torch.device(device), shifts=False)
+        return validate(weights_to_network(weights, encoder).to(device), pairs, torch.device(device))
 
     return evaluate
 

@@ -7,9 +7,6 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.learning.settings import TrainingSettings
 
-DETECTOR: Final = "detector.onnx"
-"""File of the released detector in the output folder."""
-
 StrategyName = Literal["fedavg", "fedmedian"]
 
 RELEASE: Final = "release"
