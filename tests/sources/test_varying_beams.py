@@ -64,28 +64,6 @@ def log_of_counts(counts):
     return [flaser(100 + 0.1 * k, log_pose(k), ranges=(1.0,) * count) for k, count in enumerate(counts)]
 
 
-def first_degrees(path):
-    return [round(math.degrees(scan.laser.angle_min_rad), 6) for scan in scans_of(open_source(path))]
-
-
-def test_a_log_that_interleaves_four_scans(tmp_path):
-    path = save(tmp_path / "run.log", log_of_counts([181, 180, 180, 180] * 8))
-    assert first_degrees(path) == [-90.0, -89.75, -89.5, -89.25] * 8
-    assert open_source(path).survey().lasers[0].beam_count == 181
-
-
-def test_a_log_that_begins_within_a_cycle_and_misses_scans_later(tmp_path):
-    path = save(tmp_path / "run.log", log_of_counts([180, 181, *[180, 180, 180, 181] * 6, 180, 181]))
-    assert first_degrees(path)[:6] == [-89.75, -90.0, -89.75, -89.5, -89.25, -90.0]
-    assert first_degrees(path)[-3:] == [-90.0, -89.75, -90.0]
-
-
-def test_a_log_with_a_part_of_the_interleaved_scans(tmp_path):
-    """The place of a scan in its cycle is not known: half an increment is wrong by a quarter of one at most."""
-    path = save(tmp_path / "run.log", log_of_counts([180, 181, 180, 181, 181, 180, 180, 181, 180, 180] * 4))
-    assert set(first_degrees(path)) == {-90.0, -89.5}
-
-
 def test_a_log_of_one_count_is_what_it_was(tmp_path):
     lines = log_of_counts([180] * 60)
     lines[30] = flaser(103.0, log_pose(30), ranges=(1.0,) * 181)

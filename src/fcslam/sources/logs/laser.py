@@ -8,8 +8,7 @@ A geometry stated in a scan line (ROBOTLASER1) is used. Otherwise the beam count
 - any other count spans 180 degrees: 180 beams are 1 degree apart (-90 .. +89), 181 too (-90 .. +90), 360 and 361
   are 0.5 degrees apart.
 
-In all of them beam ``n // 2`` looks straight ahead. If the count alternates between two neighbours, as 181, 180, 180,
-180, the scanner interleaves its scans: those with one beam less lie between the beams of the others.
+In all of them beam ``n // 2`` looks straight ahead.
 
 A range of 50 m or more is not a return. SICK scanners send 81.8 to 81.9 m, about 51.2 m or 50 m for it, depending on
 their resolution, and logs do not say which; beyond 50 m indoors nothing is lost. The parameter
@@ -18,17 +17,12 @@ their resolution, and logs do not say which; beyond 50 m indoors nothing is lost
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from math import degrees, isfinite, radians
-from typing import NamedTuple
 
 from fcslam.records import Beams, LaserModel
 from fcslam.sources.gate import TOLERATED_SHARE, usual_beams
 from fcslam.sources.logs.carmen import SICK_MAX_RANGE_M, ScanLine, StatedLaser
 from fcslam.sources.pose import Pose, relative_pose
-
-FEWEST_INTERLEAVED = 2
-"""Least number of scans with each of two counts, among the first ones, of a scanner that interleaves."""
 
 _MOUNTING_TOLERANCE = 0.01
 """Largest difference between the mountings of two scans, in metres or radians."""
@@ -36,63 +30,20 @@ _FULL_TURN_DEG = 360.0
 _RESOLUTION_DEG = {101: 1.0, 201: 0.5, 401: 0.25, 541: 0.5, 1081: 0.25}
 
 
-class Interleaving(NamedTuple):
-    """A scanner with interleaved scans, for example a SICK: the first of a cycle has one more beam."""
-
-    full_count: int
-    """Beams of the first scan of a cycle; the others have one less."""
-    cycle: int | None
-    """Scans in a cycle; None if scans are missing, so that the place of a scan in its cycle is not known."""
-
-
-def first_beams(scans: Sequence[ScanLine], parameters: Mapping[str, str]) -> tuple[Beams, Interleaving | None]:
-    """The usual beams of the first scans of a log, and whether those that state no angles interleave."""
+def usual_log_beams(scans: Sequence[ScanLine], parameters: Mapping[str, str]) -> Beams:
+    """The usual beams of the first scans of a log."""
     stated = [Beams(scan.beam_count, *scan.stated[:2]) for scan in scans if scan.stated is not None]
     if stated:
-        return usual_beams(stated), None
-    counts = [scan.beam_count for scan in scans]
-    interleaved = interleaving(counts)
-    (usual, _), *_ = Counter(counts).most_common(1)
-    full = usual if interleaved is None else interleaved.full_count
-    return Beams(full, *assumed_laser(full, parameters)[:2]), interleaved
+        return usual_beams(stated)
+    (count, _), *_ = Counter(scan.beam_count for scan in scans).most_common(1)
+    return Beams(count, *assumed_laser(count, parameters)[:2])
 
 
-def interleaving(beam_counts: Sequence[int]) -> Interleaving | None:
-    """Whether consecutive scans with these counts, which state no angles, interleave."""
-    (usual, _), *_ = Counter(beam_counts).most_common(1)
-    for full in (usual, usual + 1):
-        if min(beam_counts.count(full), beam_counts.count(full - 1)) >= FEWEST_INTERLEAVED:
-            starts = [k for k, count in enumerate(beam_counts) if count == full]
-            steps = {after - before for before, after in pairwise(starts)}
-            return Interleaving(full, steps.pop() if len(steps) == 1 else None)
-    return None
-
-
-class LogBeams:
-    """The beams of the scans of one pass over a log, line by line."""
-
-    def __init__(self, declared: Beams, interleaving: Interleaving | None) -> None:
-        """``declared`` are those of the laser; with interleaving, of the first scan of a cycle."""
-        self._declared = declared
-        self._interleaving = interleaving
-        self._since_full = 0
-
-    def of(self, scan: ScanLine) -> Beams | None:
-        """The beams that the line states, or those of the laser; None if there are more or fewer and no angles.
-
-        A scan between two full ones is turned by its share of an increment, by half if its place is not known.
-        """
-        if scan.stated is not None:
-            return Beams(scan.beam_count, scan.stated.angle_min_rad, scan.stated.angle_increment_rad)
-        self._since_full = 0 if scan.beam_count == self._declared.beam_count else self._since_full + 1
-        if not self._since_full:
-            return self._declared
-        if self._interleaving is None or scan.beam_count != self._declared.beam_count - 1:
-            return None
-        cycle = self._interleaving.cycle
-        share = self._since_full / cycle if cycle is not None and self._since_full < cycle else 0.5
-        _, first_rad, increment_rad = self._declared
-        return Beams(scan.beam_count, first_rad + share * increment_rad, increment_rad)
+def beams_of(scan: ScanLine, declared: Beams) -> Beams | None:
+    """The beams that the line states, or those of the laser; None if there are more or fewer and no angles."""
+    if scan.stated is not None:
+        return Beams(scan.beam_count, scan.stated.angle_min_rad, scan.stated.angle_increment_rad)
+    return declared if scan.beam_count == declared.beam_count else None
 
 
 class MountingEstimate:
@@ -123,15 +74,6 @@ class MountingEstimate:
         if self._differing > TOLERATED_SHARE * self._count or not any(agreed):
             return (offset_m, 0.0, 0.0)
         return agreed[0], agreed[1], agreed[2]
-
-
-def tells_more(scan: ScanLine, than: ScanLine) -> bool:
-    """Whether a scan says more about the laser: the angles of its beams, or how many beams a full scan has."""
-    if than.stated is not None:
-        return False
-    if scan.stated is not None:
-        return scan.beam_count == than.beam_count
-    return scan.beam_count > than.beam_count
 
 
 def laser_model(scan: ScanLine, parameters: Mapping[str, str], mounting: MountingEstimate) -> LaserModel:

@@ -34,12 +34,10 @@ from fcslam.sources.logs.carmen import (
     is_raw,
 )
 from fcslam.sources.logs.laser import (
-    Interleaving,
-    LogBeams,
     MountingEstimate,
-    first_beams,
+    beams_of,
     laser_model,
-    tells_more,
+    usual_log_beams,
 )
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary, check_units
 from fcslam.sources.pose import UNKNOWN_POSE, Pose
@@ -66,7 +64,6 @@ class _Reading(NamedTuple):
     """Summary of a log, and how to read it."""
 
     survey: Survey
-    interleaving: Interleaving | None
     pose_from_odometry: bool
     """Whether scans take the pose of the latest odometry message, because their own never changes."""
     has_odometry: bool
@@ -140,20 +137,21 @@ class TextLog:
         """Summary from one pass over the whole log; rejects a log that cannot be mapped."""
         audit, sample, mounting = Audit(), RangeSample(), MountingEstimate()
         scans, odometry, parameters = PathSummary(), PathSummary(), dict[str, str]()
-        declared, interleaving = self._first_look()
-        gate, log_beams = ScanGate(declared, audit), LogBeams(declared, interleaving)
+        declared = self._first_look()
+        gate = ScanGate(declared, audit)
         telling: ScanLine | None = None
         for number, line in _sound(self._all_lines(), audit):
             if isinstance(line, ParameterLine):
                 parameters[line.name] = line.value
             elif isinstance(line, OdometryLine):
                 odometry.add(line.stamp, line.T_odom_base)
-            elif gate.admits(number, line.stamp, log_beams.of(line)):
+            elif gate.admits(number, line.stamp, beams_of(line, declared)):
                 _note_clock(number, line, audit)
                 self._sample(sample, line)
                 scans.add(line.stamp, line.T_odom_base)
                 mounting.add(line)
-                telling = line if telling is None or tells_more(line, telling) else telling
+                if telling is None or (telling.stated is None and line.stated is not None):
+                    telling = line  # a line that states the angles says more
         assert telling is not None  # the first scans have the beams that the gate admits
         path, faults = self._path, audit.faults()
         check_consistency(path, faults, scans.count, odometry.count)
@@ -173,7 +171,7 @@ class TextLog:
             faults,
             (*(f"{path}: {note}" for note in notes), *placeholder_note(path, placeholders, "")),
         )
-        return _Reading(survey, interleaving, pose_from_odometry, driven.fault is None, placeholders)
+        return _Reading(survey, pose_from_odometry, driven.fault is None, placeholders)
 
     @staticmethod
     def _sample(sample: RangeSample, line: ScanLine) -> None:
@@ -184,8 +182,8 @@ class TextLog:
             ranges_m = _parse_ranges(line, 0, Audit())
             sample.add(line.T_odom_base, ranges_m, 0.0, max_range_m)
 
-    def _first_look(self) -> tuple[Beams, Interleaving | None]:
-        """The usual beams of the first scans, and whether they interleave."""
+    def _first_look(self) -> Beams:
+        """The usual beams of the first scans."""
         audit, scans, parameters = Audit(), list[ScanLine](), dict[str, str]()
         for _, line in _sound(self._all_lines(), audit):
             if isinstance(line, ParameterLine):
@@ -200,7 +198,7 @@ class TextLog:
                 f"{self._path}: no laser scan in this CARMEN log{seen}; its lines are {self._kinds()}; "
                 "give a log with scans"
             )
-        return first_beams(scans, parameters)
+        return usual_log_beams(scans, parameters)
 
     def _kinds(self) -> str:
         """The most common first words of the lines, with their numbers."""
@@ -248,14 +246,14 @@ class TextLog:
     def _posed(self, lines: Iterable[NumberedLine], audit: Audit) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
         reading = self._reading
         declared = reading.survey.lasers[0].beams
-        gate, log_beams = ScanGate(declared, audit), LogBeams(declared, reading.interleaving)
+        gate = ScanGate(declared, audit)
         latest = None
         for number, line in _sound(lines, audit):
             if isinstance(line, OdometryLine):
                 latest = line
                 yield number, line
             elif isinstance(line, ScanLine):
-                beams = log_beams.of(line)
+                beams = beams_of(line, declared)
                 if gate.admits(number, line.stamp, beams) and beams is not None:
                     late = latest if reading.pose_from_odometry else None
                     pose = (late or line).T_odom_base if reading.has_odometry else UNKNOWN_POSE
