@@ -45,8 +45,6 @@ class _Seen(NamedTuple):
 
 @dataclass(slots=True)
 class _Laser:
-    """The state of the check for one laser."""
-
     rest: _Seen
     """The first scan where the odometry now stands."""
     turn: _Seen

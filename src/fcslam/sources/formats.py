@@ -2,8 +2,8 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,8 @@ from fcslam.sources.logs.textlog import TextLog
 from fcslam.sources.source import Source
 from fcslam.untrusted import open_file
 
-_BAG = "ROS bag"
+LOG, BAG = "CARMEN log", "ROS bag"
+"""The formats."""
 _OTHERS: tuple[tuple[int, bytes, str], ...] = (
     (0, b"PK\x03\x04", "is a zip archive; unpack it and give the recording in it"),
     (0, b"7z\xbc\xaf\x27\x1c", "is a 7z archive; unpack it and give the recording in it"),
@@ -37,24 +38,6 @@ _SCANS_SHARED = 20
 """Scans that two recordings share at least if they overlap."""
 
 
-@dataclass(frozen=True, slots=True)
-class Format:
-    """A format of recordings."""
-
-    name: str
-    recognises: Callable[[Path, bytes], bool]
-    """Whether a path and its first bytes (decompressed; empty for a folder) have this format."""
-    open: Callable[[Path, str, BagOptions | None], Source]
-    """Opens a path with the robot's name, and options, which are for bags only."""
-
-
-FORMATS: tuple[Format, ...] = (
-    Format("CARMEN log", is_carmen, lambda path, name, _: TextLog(path, name)),
-    Format(_BAG, is_bag, RosBag),
-)
-"""Tried in this order. To add a format, add an entry."""
-
-
 def open_fleet(
     recordings: Iterable[tuple[Path | Source, str | None]], options: BagOptions | None = None
 ) -> list[Source]:
@@ -62,9 +45,6 @@ def open_fleet(
 
     A bag of several robots gives each of them. Where ``options`` leave a choice of topics, all bags of one robot are
     read from the same ones if all have them. Sources that are open already stay as they are.
-
-    Raises:
-        SourceError: as ``open_source``, a bag cannot be read, or a recording is given twice.
     """
     sources: list[Source] = []
     given: list[tuple[Path, str, Source]] = []
@@ -92,11 +72,7 @@ def _files(recording: Path) -> list[Path]:
 
 
 def check_copies(sources: Sequence[Source]) -> None:
-    """Refuse a recording that is there twice, whole or cut, whatever the names and formats of its files are.
-
-    Raises:
-        SourceError: two recordings share scans.
-    """
+    """Refuse a recording that is there twice, whole or cut, whatever the names and formats of its files are."""
     if len(sources) < 2:
         return
     owners: dict[int, Source] = {}
@@ -142,16 +118,17 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
             are given for a recording that is not a bag.
     """
     path, robot = robot_in(Path(path))
-    kind = format_of(path)
-    if (options is not None or robot is not None) and kind.name != _BAG:
-        raise SourceError(
-            f"{path}: a {kind.name} has neither topics nor tf; --sensors and a robot after a colon go with ROS bags "
-            "only, leave them out"
-        )
+    if format_of(path) == LOG:
+        if options is not None or robot is not None:
+            raise SourceError(
+                f"{path}: a {LOG} has neither topics nor tf; --sensors and a robot after a colon go with ROS bags "
+                "only, leave them out"
+            )
+        return TextLog(path, name or _robot_name(path))
     if robot is not None:
         options = replace(options or BagOptions(), robot=robot)
         name = name or robot.strip("/").replace("/", "_")
-    return kind.open(path, name or _robot_name(path), options)
+    return RosBag(path, name or _robot_name(path), options)
 
 
 def _robot_name(path: Path) -> str:
@@ -160,28 +137,22 @@ def _robot_name(path: Path) -> str:
     return os.path.commonprefix(names).strip("._-") or names[0]  # noqa: RUF071  of letters
 
 
-def format_of(path: Path) -> Format:
-    """The format of the recording at ``path``, by its content.
-
-    Raises:
-        SourceError: as ``open_source``.
-    """
+def format_of(path: Path) -> str:
+    """The format of the recording at ``path``, ``LOG`` or ``BAG``, by its content."""
     parts = parts_of(path)
     if len(parts) > 1 and not os.path.isdir(path):
         for part in parts:
-            if (kind := format_of(part)).name != _BAG:
-                raise SourceError(
-                    f"{part}: a {kind.name} is not a part of several; give one recording, or parts of a bag"
-                )
-        return kind
+            if format_of(part) == LOG:
+                raise SourceError(f"{part}: a {LOG} is not a part of several; give one recording, or parts of a bag")
+        return BAG
     content = b"" if is_folder(path) else head(path)
     _refuse_others(path, content)
+    if is_carmen(content):
+        return LOG
     with translate_errors(path):
-        for kind in FORMATS:
-            if kind.recognises(path, content):
-                return kind
-    *others, last = (kind.name for kind in FORMATS)
-    known = f"{', '.join(others)} or {last}"
+        if is_bag(path, content):
+            return BAG
+    known = f"{LOG} or {BAG}"
     if is_folder(path):
         raise SourceError(f"{path}: is a folder, not a recording; give the file of a recording ({known})")
     if path.name == "metadata.yaml":

@@ -107,12 +107,7 @@ def scan_window(
 
 
 def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_count: int, first_errors: str = "") -> None:
-    """Reject a recording with too many inconsistent or damaged scans; ``first_errors`` say what is damaged.
-
-    Raises:
-        SourceError: it is mostly damaged, most scans are of another laser than the first ones, or its time jumps or
-            runs back.
-    """
+    """Reject a recording with too many inconsistent or damaged scans; ``first_errors`` say what is damaged."""
     broken = sum(faults[kind].count for kind in (Fault.BROKEN_LINE, Fault.BROKEN_MESSAGE))
     other, contradictory, misplaced, reversals = (
         faults[kind] for kind in (Fault.OTHER_BEAMS, Fault.BAD_BEAMS, Fault.MISPLACED_SCAN, Fault.TIME_REVERSAL)

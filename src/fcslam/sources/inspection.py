@@ -97,13 +97,9 @@ class Inspection:
 
 
 def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
-    """Read a recording once or twice and say what is in it.
-
-    Raises:
-        SourceError: it is not a recording of a known format, or cannot be read at all.
-    """
+    """Read a recording once or twice and say what is in it."""
     source = open_source(path, options)
-    name = format_of(robot_in(path)[0]).name
+    name = format_of(robot_in(path)[0])
     bag = _bag_contents(source.bag) if isinstance(source, RosBag) else None
     try:
         robots = source.robots() if isinstance(source, RosBag) else []

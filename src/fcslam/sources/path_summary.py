@@ -174,11 +174,7 @@ class PathSummary:
 
 
 def check_units(path: Path, driven: PathSummary) -> None:
-    """Reject odometry in millimetres, centimetres or degrees.
-
-    Raises:
-        SourceError: the robot drives faster than any, or not where its headings point.
-    """
+    """Reject odometry in millimetres, centimetres or degrees."""
     if driven.is_in_degrees:
         raise SourceError(
             f"{path}: the headings of the odometry are in degrees, as the robot drives where they then point; convert "

@@ -136,9 +136,6 @@ class RangeSample:
             path: of the recording.
             which: the laser, empty or with a blank before it.
             remedy: what to check if nearly no beam has a return.
-
-        Raises:
-            SourceError: the laser measures nothing or in another unit.
         """
         if len(self._samples) < FEWEST_SCANS:
             return

@@ -30,11 +30,7 @@ def robot_name(path: Path) -> str:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder, and no file.
-
-    Raises:
-        SourceError: there is nothing that can be read, or something that can be read only once.
-    """
+    """Whether there is a folder, and no file."""
     with translate_errors(path):
         mode = path.stat().st_mode
         if not (S_ISDIR(mode) or S_ISREG(mode)):
@@ -43,11 +39,7 @@ def is_folder(path: Path) -> bool:
 
 
 def head(path: Path) -> bytes:
-    """The first 64 KiB, decompressed.
-
-    Raises:
-        SourceError: the path is missing or not a file, or the file is empty or damaged.
-    """
+    """The first 64 KiB, decompressed."""
     with translate_errors(path), open_unpacked(path) as stream:
         content = stream.read(_HEAD_BYTES)
     if not content:
@@ -56,11 +48,7 @@ def head(path: Path) -> bytes:
 
 
 def numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Decompressed lines with their numbers, counted from 1.
-
-    Raises:
-        SourceError: the file cannot be read to its end.
-    """
+    """Decompressed lines with their numbers, counted from 1."""
     with translate_errors(path), open_unpacked(path) as stream:
         yield from enumerate(iter(partial(stream.readline, MAX_LINE_BYTES), b""), start=1)
 

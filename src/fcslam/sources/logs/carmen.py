@@ -18,7 +18,6 @@ TRUEPOS ...) are passed over; a line that starts with no message name is broken.
 import re
 from collections.abc import Callable
 from math import isfinite, nan
-from pathlib import Path
 from typing import NamedTuple
 
 from fcslam.geometry.beams import is_field_of_view
@@ -83,7 +82,7 @@ class ParameterLine(NamedTuple):
 Line = ScanLine | OdometryLine | ParameterLine
 
 
-def is_carmen(_: Path, head: bytes) -> bool:
+def is_carmen(head: bytes) -> bool:
     """Whether the first bytes of a file are those of a CARMEN log."""
     return bool(_KNOWN.search(head))
 

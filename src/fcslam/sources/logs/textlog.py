@@ -183,7 +183,6 @@ class TextLog:
             sample.add(line.T_odom_base, ranges_m, 0.0, max_range_m)
 
     def _first_look(self) -> Beams:
-        """The usual beams of the first scans."""
         audit, scans, parameters = Audit(), list[ScanLine](), dict[str, str]()
         for _, line in _sound(self._all_lines(), audit):
             if isinstance(line, ParameterLine):
