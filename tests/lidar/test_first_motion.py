@@ -9,7 +9,7 @@ import pytest
 from fcslam.geometry import se2
 from fcslam.lidar.first_motion import first_sweep
 from fcslam.records import Sweep, frozen
-from fcslam.robot.motion_prediction import PREDICTED
+from fcslam.robot.predicted_motion import PREDICTED
 from tests.robot import spinning
 
 

@@ -21,7 +21,7 @@ from fcslam.lidar.odometry import OdometryTrust
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import LaserModel, frozen
 from fcslam.robot.frontend import RobotFrontend
-from fcslam.robot.motion_prediction import PREDICTED
+from fcslam.robot.predicted_motion import PREDICTED
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
 
 pytestmark = pytest.mark.slow

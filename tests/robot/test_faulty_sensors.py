@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.robot.odometry_gate import FROZEN
+from fcslam.robot.wheel_odometry import FROZEN
 from tests import small_fleet
 
 FIRST, LAST = 60, 100
@@ -62,7 +62,7 @@ def test_odometry_that_freezes_on_the_way_ends_the_session_and_is_not_used_again
         scans[number] = replace(scan, T_odom_base=pose)
     frontend = drive(scans)
     before, after = frontend.tracks
-    assert frontend.odometry.fault == FROZEN
+    assert frontend.odometry.check.fault == FROZEN
     assert not frontend.motion.model.is_measured
     assert len(before) + len(after) > 0.95 * len(scans)
     assert scans[FIRST - 2].stamp <= before.stamps[-1] < scans[LAST].stamp
@@ -81,7 +81,7 @@ def test_people_who_pass_a_robot_at_rest_end_no_session(robot):
         noisy = (ranges_m + rng.normal(0.0, 0.01, len(ranges_m))).astype(np.float32)
         scans.append(replace(scans[FIRST], stamp=scans[FIRST].stamp + (number + 1) / 3.0, ranges_m=noisy))
     frontend = drive(scans)
-    assert frontend.odometry.fault is None
+    assert frontend.odometry.check.fault is None
     assert len(frontend.tracks) == 1
 
 

@@ -185,7 +185,7 @@ class LiveTracker(ABC):
         pose = self._pose = self._pose_of(newest, T_smooth_base, T_odom_base)
         if self._frontend.motion is not self._frontend.odometry:
             self._tell_undetermined(pose)
-        if (fault := self._frontend.odometry.fault) is not None:
+        if (fault := self._frontend.odometry.check.fault) is not None:
             self._tell_failure(f"the odometry {fault}; scan matching alone gives the motion")
         if watched := self._facing[scan.laser.T_base_laser].add(scan):
             with suppress(RuntimeError):  # a worker that has ended is told by what needs it

@@ -26,7 +26,7 @@ from fcslam.lidar.leaning import floor_line
 from fcslam.lidar.own_body import body_sectors
 from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
-from fcslam.robot.motion_prediction import PREDICTED, MotionPrediction
+from fcslam.robot.predicted_motion import PREDICTED, MotionPrediction
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.contradictions import RepeatedScans

@@ -21,7 +21,7 @@ from fcslam.lidar.lost import (
 )
 from fcslam.lidar.tracker import TrackingResult
 from fcslam.records import CameraImage, LaserScan
-from fcslam.robot.motion import Deferred
+from fcslam.robot.predicted_motion import Deferred
 from fcslam.robot.session import Session
 
 

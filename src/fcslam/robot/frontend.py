@@ -27,10 +27,11 @@ from fcslam.robot.backend import BackendInput, NewDetector, PlaceKeyframes, Robo
 from fcslam.robot.backend_runner import BackendRunner, InlineBackend
 from fcslam.robot.deferred_scans import DeferredScans, Outcome
 from fcslam.robot.mapped_scans import MappedScans
-from fcslam.robot.motion import Motion, PredictedMotion, WheelOdometry
 from fcslam.robot.packet_queue import PacketQueue
-from fcslam.robot.session import Session, WaitingFixes
+from fcslam.robot.predicted_motion import PredictedMotion
+from fcslam.robot.session import Motion, Session, WaitingFixes
 from fcslam.robot.track import ScanTrack
+from fcslam.robot.wheel_odometry import WheelOdometry
 from fcslam.sources.contradictions import RepeatedScans
 from fcslam.sources.gate import is_clock_step
 from fcslam.wire.messages import Body, Packet
@@ -77,7 +78,7 @@ class RobotFrontend:
         self.robot = robot
         self.tracks: list[ScanTrack] = []
         """Poses of the scans, by session."""
-        self.odometry = WheelOdometry(config.lidar.scan_duration_s)
+        self.odometry = WheelOdometry()
         self._motion: Motion = self.odometry
         """Of the sessions from the next one on."""
         self.packets = PacketQueue(
@@ -174,21 +175,21 @@ class RobotFrontend:
             self.change_floor(scan.new_floor)
         if is_clock_step(self._before_s, scan.stamp):
             if self._motion is not self.odometry:
-                self._motion = PredictedMotion(self._config.lidar.scan_duration_s)
+                self._motion = PredictedMotion()
             self.begin_session()
         self._before_s = self._before_s[1], scan.stamp
 
     def _predict(self, scan: LaserScan) -> LaserScan:
         """Give the scan its predicted pose and the velocity of its sweep."""
-        if self._motion is self.odometry and self.odometry.says_nothing(scan):
+        if self._motion is self.odometry and self.odometry.check.says_nothing(scan):
             self._begin_without_odometry()
         return self._session.place(scan, self._before)
 
     def _begin_without_odometry(self) -> None:
         """Begin a session whose motion is predicted, with the scans at which the odometry was frozen."""
-        self._motion, held = PredictedMotion(self._config.lidar.scan_duration_s), []
-        if self.odometry.may_be_frozen:
-            self.scan_poses.cut(self.odometry.certain_s)
+        self._motion, held = PredictedMotion(), []
+        if self.odometry.check.may_be_frozen:
+            self.scan_poses.cut(self.odometry.check.certain_s)
             held = self._deferred.take()
         self.begin_session()
         for record in held:

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,15 +12,20 @@ from fcslam.lidar.first_motion import LONGEST_GAP_S
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend, ScanPose
 from fcslam.lidar.lost import drove_on
 from fcslam.lidar.tracker import DOUBTFUL, TrackedScan, TrackingResult
-from fcslam.records import CameraImage, FloatArray, GnssFix, KeyscanFix, KeyscanId, LaserScan
+from fcslam.records import CameraImage, FloatArray, GnssFix, KeyscanFix, KeyscanId, LaserScan, Sweep
 from fcslam.robot.backend import BackendInput, NewImage, NewKeyscan
-from fcslam.robot.motion import Deferred, Motion, PredictedMotion
+from fcslam.robot.predicted_motion import Deferred, PredictedMotion
 from fcslam.robot.track import ScanTrack
+from fcslam.robot.wheel_odometry import WheelOdometry, moving_on
 
 LATE_S = 0.5
 """Largest time between a fix and the scan whose pose it measures."""
 MOST_FIXES = 100
 """Fixes that wait for a scan; older ones are dropped."""
+
+
+Motion = WheelOdometry | PredictedMotion
+"""How a robot moves up to each scan and during it."""
 
 
 class WaitingFixes:
@@ -60,9 +66,12 @@ class Session:
 
     def place(self, scan: LaserScan, before: LaserScan | None) -> LaserScan:
         """The next scan with its pose and velocity by odometry or prediction; ``before`` is the one before it."""
-        if isinstance(self.motion, PredictedMotion):
-            return self.motion.place(scan)
-        return self.motion.place(scan, before)
+        duration_s = self.lidar.config.scan_duration_s
+        if scan.sweep is None and duration_s > 0.0:
+            scan = replace(scan, sweep=Sweep(0.0, duration_s))
+            if before is not None and isinstance(self.motion, WheelOdometry):
+                scan = moving_on(scan, before)
+        return self.motion.place(scan)
 
     def track(self, scan: LaserScan) -> tuple[LaserScan, TrackingResult]:
         """Localize a scan; returns it as it was deskewed, too."""
@@ -97,7 +106,7 @@ class Session:
     @property
     def may_be_frozen(self) -> bool:
         """Whether the odometry stands still although the newest scans have changed."""
-        return not isinstance(self.motion, PredictedMotion) and self.motion.may_be_frozen
+        return isinstance(self.motion, WheelOdometry) and self.motion.check.may_be_frozen
 
     def drove_on(self, scans: Sequence[LaserScan]) -> bool:
         """Whether odometry without a jump and the scans agree that the robot drove to where doubtful scans are."""

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from fcslam.geometry import se2
+from fcslam.lidar.first_motion import LONGEST_GAP_S
+from fcslam.lidar.odometry import WHEELS
 from fcslam.records import CameraImage, FloatArray, LaserScan, frozen
 from fcslam.sources.contradictions import CHANGED, changed_share, stands_still
 from fcslam.sources.path_summary import PathSummary
@@ -31,10 +33,14 @@ FROZEN = "stands still while the scans change"
 """Fault of odometry that measured the motion before."""
 
 
-class OdometryGate:
-    """Moves the frame ``odom`` at every jump, so that odometry goes on as before the jump."""
+class WheelOdometry:
+    """Motion by wheel odometry. It moves the frame ``odom`` at every jump, so that odometry goes on as before it."""
+
+    model = WHEELS
 
     def __init__(self) -> None:
+        self.check = WheelCheck()
+        """Whether it says anything."""
         self.jumps = 0
         """Number of jumps so far."""
         self.largest_m = 0.0
@@ -48,7 +54,7 @@ class OdometryGate:
         self._velocity = (0.0, 0.0, 0.0)
         """In the last sweep without a jump."""
 
-    def scan(self, scan: LaserScan) -> LaserScan:
+    def place(self, scan: LaserScan) -> LaserScan:
         """The next scan, with its odometry free of jumps."""
         read = scan.T_odom_base
         if self._last is not None:
@@ -82,7 +88,7 @@ class OdometryGate:
             return scan
         return replace(scan, sweep=sweep._replace(velocity=self._velocity, acceleration=(0.0, 0.0, 0.0)))
 
-    def image(self, image: CameraImage) -> CameraImage:
+    def place_image(self, image: CameraImage) -> CameraImage:
         """An image taken since the last scan, with its odometry in the same frame."""
         if self._bridge is None or image.T_odom_base is None:
             return image
@@ -118,7 +124,7 @@ class WheelCheck:
         """Whether odometry that measured the motion before stands still, and the newest scan has changed."""
         return self._changed > 0 and self._path.says_something
 
-    def say_nothing(self, scan: LaserScan) -> bool:
+    def says_nothing(self, scan: LaserScan) -> bool:
         """Whether the odometry up to the next scan says nothing while the scans change, or the first one has none."""
         if self._at_rest is None:
             self._at_rest = scan
@@ -136,3 +142,12 @@ class WheelCheck:
         if self._changed >= SCANS_THAT_CHANGED:
             self.fault = FROZEN if self._path.says_something else self._path.fault
         return self.fault is not None
+
+
+def moving_on(scan: LaserScan, before: LaserScan) -> LaserScan:
+    """The scan with the velocity since the one before, by odometry, in its sweep."""
+    elapsed_s = scan.stamp - before.stamp
+    if scan.sweep is None or not 0.0 < elapsed_s <= LONGEST_GAP_S:
+        return scan
+    x, y, theta = (se2.log(se2.between(before.T_odom_base, scan.T_odom_base)) / elapsed_s).tolist()
+    return replace(scan, sweep=scan.sweep._replace(velocity=(x, y, theta)))

@@ -8,7 +8,7 @@ import pytest
 from fcslam.geometry import se2
 from fcslam.records import CameraImage, CameraModel, Channel, LaserModel, LaserScan, Transform, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.robot.odometry_gate import OdometryGate
+from fcslam.robot.wheel_odometry import WheelOdometry
 from tests import small_fleet
 
 LASER = LaserModel(3, -1.0, 1.0, 10.0)
@@ -29,9 +29,9 @@ def wandering(count, seed):
 
 
 def test_odometry_without_a_jump_is_not_touched():
-    scans, gate = scans_of(wandering(100, 0)), OdometryGate()
-    assert all(gate.scan(scan) is scan for scan in scans)
-    assert gate.jumps == 0
+    scans, odometry = scans_of(wandering(100, 0)), WheelOdometry()
+    assert all(odometry.place(scan) is scan for scan in scans)
+    assert odometry.jumps == 0
 
 
 @pytest.mark.parametrize("far", [(30.0, 0.0, 0.0), (3e3, -2e3, 1.0), (1e5, 1e5, -3.0), (0.0, 0.0, 3.1)])
@@ -41,10 +41,10 @@ def test_motions_that_do_not_jump_are_kept_whatever_jumps_lie_between(far, lasti
     poses = wandering(60, 1)
     read = poses.copy()
     read[30 : 30 + lasting] = se2.compose(np.array(far), poses[30 : 30 + lasting])
-    gate = OdometryGate()
-    bridged = np.array([gate.scan(scan).T_odom_base for scan in scans_of(read)])
+    odometry = WheelOdometry()
+    bridged = np.array([odometry.place(scan).T_odom_base for scan in scans_of(read)])
     jumped = {29} | ({29 + lasting} if 30 + lasting < 60 else set())
-    assert gate.jumps == len(jumped)
+    assert odometry.jumps == len(jumped)
     kept = [k for k in range(59) if k not in jumped]
     np.testing.assert_allclose(se2.relative(bridged)[kept], se2.relative(poses)[kept], atol=1e-6)
     assert np.hypot(*se2.relative(bridged)[:, :2].T).max() < 0.25
@@ -54,42 +54,44 @@ def test_motions_that_do_not_jump_are_kept_whatever_jumps_lie_between(far, lasti
 def test_a_reading_that_is_no_number_is_bridged(broken):
     poses = wandering(20, 2)
     poses[10] = broken
-    gate = OdometryGate()
-    bridged = np.array([gate.scan(scan).T_odom_base for scan in scans_of(poses)])
+    odometry = WheelOdometry()
+    bridged = np.array([odometry.place(scan).T_odom_base for scan in scans_of(poses)])
     assert np.isfinite(bridged).all()
-    assert gate.jumps == 1
+    assert odometry.jumps == 1
 
 
 def test_a_bridge_is_never_taken_for_standing_still():
     """The tracker does not match the scans of a robot that stands."""
     poses = np.zeros((10, 3))
     poses[5:, 0] = 1e3
-    gate = OdometryGate()
-    bridged = np.array([gate.scan(scan).T_odom_base for scan in scans_of(poses)])
+    odometry = WheelOdometry()
+    bridged = np.array([odometry.place(scan).T_odom_base for scan in scans_of(poses)])
     assert np.hypot(*(bridged[5] - bridged[4])[:2]) == pytest.approx(0.02)
 
 
 def test_scans_without_a_clock_may_be_metres_apart():
     poses = np.zeros((5, 3))
     poses[:, 0] = 4.0 * np.arange(5)
-    gate = OdometryGate()
+    odometry = WheelOdometry()
     for scan in scans_of(poses, step_s=0.0):
-        gate.scan(scan)
-    assert gate.jumps == 0
+        odometry.place(scan)
+    assert odometry.jumps == 0
 
 
 def test_images_move_with_the_scans():
     poses = wandering(40, 3)
     read = poses.copy()
     read[20:] = se2.compose(np.array((500.0, 0.0, 2.0)), poses[20:])
-    gate = OdometryGate()
+    odometry = WheelOdometry()
     for scan in scans_of(read):
-        seen = gate.scan(scan)
+        seen = odometry.place(scan)
         offset = np.array((0.1, 0.02, 0.03))
         image = CameraImage(scan.stamp, b"", CAMERA, frozen(se2.compose(scan.T_odom_base, offset)))
-        np.testing.assert_allclose(se2.between(seen.T_odom_base, gate.image(image).T_odom_base), offset, atol=1e-6)
+        np.testing.assert_allclose(
+            se2.between(seen.T_odom_base, odometry.place_image(image).T_odom_base), offset, atol=1e-6
+        )
         without = replace(image, T_odom_base=None)
-        assert gate.image(without) is without
+        assert odometry.place_image(without) is without
 
 
 @pytest.mark.slow

@@ -1,14 +1,18 @@
 """Motion of a robot without wheel odometry: the one of the last scans goes on, and scan matching corrects it."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.lidar.first_motion import LONGEST_GAP_S
+from fcslam.lidar.first_motion import LONGEST_GAP_S, first_sweep
+from fcslam.lidar.frontend import LidarFrontend
+from fcslam.lidar.lost import SEEN_S, is_in_reach, is_unplaced, relocated
 from fcslam.lidar.odometry import OdometryModel
-from fcslam.records import FloatArray, LaserScan, Sweep, frozen
+from fcslam.lidar.tracker import TrackedScan, TrackingResult
+from fcslam.records import CameraImage, FloatArray, LaserScan, Sweep, frozen
 
 LEAST_SHARE, LARGEST_SHARE = 0.5, 3.0
 """Limits of the next motion as a share of the last one: intervals vary if scans are dropped, but also if stamps are
@@ -22,6 +26,10 @@ PREDICTED = OdometryModel(
 )
 """Model of a robot without odometry: every scan is matched, and the prediction is trusted little. Within a tenth of a
 second, a robot may brake or turn by so much."""
+InOdom = Callable[[TrackedScan], FloatArray]
+"""Gives ``T_odom_base`` of a localized scan, shape (3,), in a frame without jumps."""
+Deferred = list[LaserScan | CameraImage]
+"""Records since the first doubtful scan, which is the first of them."""
 
 
 class MotionPrediction:
@@ -122,3 +130,92 @@ class MotionPrediction:
                 self._motion = se2.log(se2.between(self._last[1], T_smooth_base))
                 self._elapsed_s = elapsed_s
         self._last = None if T_smooth_base is None else (stamp, T_smooth_base)
+
+
+class PredictedMotion:
+    """Motion of a robot without odometry: the one of the last scans goes on, and scan matching corrects it."""
+
+    model = PREDICTED
+
+    def __init__(self) -> None:
+        self._prediction = MotionPrediction()
+        self._own_map: LidarFrontend | None = None
+        """Matches doubtful scans with each other, from the second one on."""
+        self._T_odom_first = se2.IDENTITY
+        """Pose of the first one of them, shape (3,)."""
+
+    def place(self, scan: LaserScan) -> LaserScan:
+        """The next scan with the predicted pose and velocity."""
+        return self._prediction.predict(scan)
+
+    def place_image(self, image: CameraImage) -> CameraImage:
+        """An image without a pose: the robot is taken to be where the last scan was made."""
+        return replace(image, T_odom_base=None)
+
+    def awaits_second(self, scan: LaserScan) -> bool:
+        """Whether only a second scan shows the motion during this one."""
+        return self._prediction.is_new and scan.sweep is not None
+
+    def begin(self, deferred: Deferred, second: LaserScan, T_odom_first: FloatArray = se2.IDENTITY) -> LaserScan:
+        """Give the first deferred scan the motion that the second one shows; returns this one, predicted from it."""
+        first = deferred[0]
+        assert isinstance(first, LaserScan)  # images are deferred only behind a scan
+        deferred[0] = first = replace(first, sweep=first_sweep(first, second, PREDICTED))
+        self._prediction.begin(first, T_odom_first)
+        return self._prediction.predict(second)
+
+    def track(self, scan: LaserScan, frontend: LidarFrontend, in_odom: InOdom) -> tuple[LaserScan, TrackingResult]:
+        """Localize a scan, deskew it by the motion that was found, and localize it again."""
+        tracking = frontend.localize(scan)
+        if not tracking.tracked.information.any():
+            return scan, tracking
+        moving = self._prediction.moving(scan, in_odom(tracking.tracked))
+        return (scan, tracking) if moving is scan else (moving, frontend.localize(moving))
+
+    def observe(self, stamp: float, T_odom_base: FloatArray, tracked: TrackedScan) -> None:
+        """Predict the next scan from where the one at ``stamp`` was found; see ``MotionPrediction.observe``."""
+        self._prediction.observe(stamp, T_odom_base if tracked.information.any() else None, tracked.sweep)
+
+    def follow(
+        self, deferred: Deferred, scan: LaserScan, tracked: TrackedScan, frontend: LidarFrontend, in_odom: InOdom
+    ) -> LaserScan:
+        """The next doubtful scan with its motion.
+
+        The first one is where the map has it. As they may show another place, the others are matched with each other.
+        """
+        if not deferred:
+            self._own_map, self._T_odom_first = None, in_odom(tracked)
+            return self._prediction.follow(scan, self._T_odom_first, tracked.sweep)
+        origin = self._T_odom_first
+        if self._own_map is None:
+            scan = self.begin(deferred, scan, origin)
+            self._own_map = frontend.fresh()
+            self._own_map.process(_scans(deferred)[0])
+        scan, own = self.track(scan, self._own_map, lambda tracked: se2.compose(origin, tracked.T_local_base))
+        scan = self._prediction.follow(scan, se2.compose(origin, own.tracked.T_local_base), own.tracked.sweep)
+        self._own_map.process(scan, own._replace(T_odom_base=scan.T_odom_base))
+        return scan
+
+    def relocate(self, deferred: Deferred, frontend: LidarFrontend, gap_s: float) -> bool:
+        """Move doubtful scans to where the newest keyscans show them; whether they show the place before them.
+
+        Args:
+            deferred: the scans, and the images between them.
+            frontend: the robot's front end; it does not change.
+            gap_s: time before them in which nothing shows the motion; 0: there was no gap.
+        """
+        scans = _scans(deferred)
+        found = relocated(scans, frontend)
+        if found is None or not is_in_reach(found, scans[0], frontend, gap_s):
+            is_elsewhere = found is not None and not gap_s
+            return not (is_elsewhere or gap_s > SEEN_S or is_unplaced(scans[0], frontend))
+        T = se2.compose(frontend.T_odom_base(found), se2.inverse(scans[0].T_odom_base))
+        self._prediction.move(T)
+        for number, record in enumerate(deferred):
+            if isinstance(record, LaserScan):
+                deferred[number] = replace(record, T_odom_base=frozen(se2.compose(T, record.T_odom_base)))
+        return True
+
+
+def _scans(deferred: Deferred) -> list[LaserScan]:
+    return [record for record in deferred if isinstance(record, LaserScan)]
