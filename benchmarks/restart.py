@@ -11,6 +11,7 @@ did since the last snapshot, which takes 5 % of its time.
 """
 
 import heapq
+import json
 import subprocess
 import sys
 import tempfile
@@ -133,8 +134,10 @@ def worked(folder: Any, store: Any, settles: bool = False) -> float:
     """Seconds until a new worker has let every packet take effect; it is killed then, or after its next snapshot."""
     size = len(store.envelopes())
     began = time.perf_counter()
-    command = [sys.executable, "-m", "fcslam.service.worker", str(folder.path)]
+    command = [sys.executable, "-m", "fcslam.service.worker"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+        process.stdin.write(json.dumps({"folder": str(folder.path)}).encode() + b"\n")
+        process.stdin.flush()
         written_ns = written(folder)
         while store.applied() < size:
             if process.poll() is not None:

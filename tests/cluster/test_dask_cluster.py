@@ -25,7 +25,7 @@ from fcslam.lidar.verification import VerificationConfig
 from fcslam.mission.mission_store import MissionStore
 from fcslam.service.credentials import make_cluster_credentials
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.supervisor import READY
+from fcslam.service.supervisor import READY, WorkerTask
 from tests import small_fleet
 from tests.cluster.clusters import Cluster, needs_dask, wait_for
 
@@ -235,11 +235,13 @@ def test_the_worker_of_a_mission_uses_the_cluster_and_outlives_it(tmp_path):
     with Cluster(tmp_path) as cluster:
         cluster.start_worker("one")
         wait_for(lambda: refusal(cluster) is None)
-        options = ["--workers", cluster.address]
-        command = [sys.executable, "-m", "fcslam.service.worker", *options, str(folder.path)]
+        task = WorkerTask(str(folder.path), cluster.address)
+        command = [sys.executable, "-m", "fcslam.service.worker"]
         with subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         ) as process:
+            process.stdin.write(json.dumps(task._asdict()).encode() + b"\n")
+            process.stdin.flush()
             while json.loads(process.stdout.readline())["event"] != READY:
                 pass
             cluster.scheduler.kill()

@@ -463,12 +463,14 @@ def told(process, event):
 
 
 def test_a_worker_waits_until_the_one_before_is_gone_and_ends_with_one_line_when_its_service_was_killed(cloud):
-    command = [sys.executable, "-m", "fcslam.service.worker", str(cloud.folder.path)]
+    command = [sys.executable, "-m", "fcslam.service.worker"]
     cloud.put(stream("a", POSES, start_s=0.0))
     pipe = subprocess.PIPE
     with cloud.folder.worker_lock.open("w") as before:
         fcntl.flock(before, fcntl.LOCK_EX)
         with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+            process.stdin.write(json.dumps({"folder": str(cloud.folder.path)}) + "\n")
+            process.stdin.flush()
             time.sleep(1.0)
             assert cloud.store.applied() == 0
             fcntl.flock(before, fcntl.LOCK_UN)
@@ -487,7 +489,7 @@ def test_a_worker_waits_until_the_one_before_is_gone_and_ends_with_one_line_when
 
 
 def test_a_worker_that_is_told_to_stop_while_it_compiles_does_so_at_once(cloud):
-    command = [sys.executable, "-m", "fcslam.service.worker", str(cloud.folder.path)]
+    command = [sys.executable, "-m", "fcslam.service.worker"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         process.terminate()
         assert process.wait(60) == -signal.SIGTERM

@@ -36,7 +36,7 @@ from fcslam.service.shared.mission_tables import Lease
 from fcslam.service.shared.missions import SharedMissions
 from fcslam.service.shared.registry import KnownMission
 from fcslam.service.shared.schema import prepare
-from fcslam.service.supervisor import WORKER, RunningWorker, StandbyWorkers, Supervisor
+from fcslam.service.supervisor import RunningWorker, StandbyWorkers, Supervisor, WorkerTask, start_worker
 from fcslam.storage.postgres import Postgres, is_server, take_password
 from fcslam.wire.http_transport import is_loopback
 
@@ -64,8 +64,8 @@ def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, wor
     events = EventStream()
 
     def launch(folder: MissionFolder) -> RunningWorker:
-        command = module_command(WORKER, str(folder.path), "--workers", workers)
-        return Supervisor(folder.name, lambda: Child(command), events.publish)
+        task = WorkerTask(str(folder.path), workers)
+        return Supervisor(folder.name, lambda: start_worker(task), events.publish)
 
     missions = Missions(data, config, time.monotonic, time.time, launch)
     return ServiceState(
@@ -95,18 +95,9 @@ def shared_state(
         def launch(mission: KnownMission, lease: Lease) -> RunningWorker:
             folder = MissionFolder(data / "missions" / mission.name)
             folder.path.mkdir(parents=True, exist_ok=True)
-            arguments = [
-                str(folder.path),
-                "--store",
-                url,
-                "--lease",
-                str(lease.mission),
-                str(lease.fence),
-                "--workers",
-                workers,
-            ]
+            task = WorkerTask(str(folder.path), workers, url, lease)
             # Events of all instances, this one included, come from the store.
-            return Supervisor(folder.name, lambda: standby.start(arguments), lambda *_: None)
+            return Supervisor(folder.name, lambda: standby.start(task), lambda *_: None)
 
         missions: SharedMissions
         events = EventStream(lambda: missions.open_mission.name)

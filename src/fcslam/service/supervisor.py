@@ -5,7 +5,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -26,10 +26,31 @@ WORKER = "fcslam.service.worker"
 """The module of workers."""
 STANDBY_WORKERS = 2
 """Standby workers that an instance keeps."""
-STANDBY = "--standby"
-"""The only argument of a worker that gets its other arguments later, as a line of JSON on stdin."""
-
 _log = logging.getLogger(__name__)
+
+
+class WorkerTask(NamedTuple):
+    """What a worker is told on its stdin, as a line of JSON."""
+
+    folder: str
+    """Folder of the mission."""
+    workers: str = "1"
+    """Who verifies closures (``cluster.verifying``)."""
+    store: str | None = None
+    """Address of the database; None: the mission is a file."""
+    lease: tuple[int, int] | None = None
+    """The mission's number in the database, and the fence."""
+
+
+def start_worker(task: WorkerTask) -> Child:
+    """Start the worker of a mission."""
+    worker = _new_worker()
+    worker.send(json.dumps(task._asdict()))
+    return worker
+
+
+def _new_worker() -> Child:
+    return Child(module_command(WORKER))
 
 
 class Supervisor:
@@ -151,16 +172,16 @@ class StandbyWorkers:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._is_closed = False
-        self._waiting = [_new() for _ in range(STANDBY_WORKERS)]
+        self._waiting = [_new_worker() for _ in range(STANDBY_WORKERS)]
 
-    def start(self, arguments: Sequence[str]) -> Child:
-        """Let a worker begin with these arguments; another one stands by in its place."""
+    def start(self, task: WorkerTask) -> Child:
+        """Let a worker begin its task; another one stands by in its place."""
         with self._lock:
             alive = [worker for worker in self._waiting if worker.pid is not None]
-            worker, self._waiting = (alive[0], alive[1:]) if alive else (_new(), [])
+            worker, self._waiting = (alive[0], alive[1:]) if alive else (_new_worker(), [])
             while len(self._waiting) < STANDBY_WORKERS and not self._is_closed:
-                self._waiting.append(_new())
-        worker.send(json.dumps(list(arguments)))
+                self._waiting.append(_new_worker())
+        worker.send(json.dumps(task._asdict()))
         return worker
 
     def close(self) -> None:
@@ -173,7 +194,3 @@ class StandbyWorkers:
                 deque(worker.events(), 0)
                 worker.wait()
             self._waiting = []
-
-
-def _new() -> Child:
-    return Child(module_command(WORKER, STANDBY))

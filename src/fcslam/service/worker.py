@@ -4,15 +4,11 @@ It reads the store by turn and keeps the fleet in memory. It writes its results 
 live run folder, and the run folders that users request. From time to time it also writes its state. If it is killed,
 the next worker continues from that state, or from turn 0, and reports nothing new before it has caught up.
 
-    python -m fcslam.service.worker [--workers ...] [--store ... --lease MISSION FENCE] MISSION_FOLDER
-    python -m fcslam.service.worker --standby
-
-A standby worker compiles its code, then waits for a line with the other arguments. A byte on stdin means that there is
-work; the end of stdin means that the service is gone. The worker prints a line when it is ready, for its progress, for
+It compiles its code, then waits for a line with its task (``WorkerTask``). A byte on stdin means that there is work;
+the end of stdin means that the service is gone. The worker prints a line when it is ready, for its progress, for
 every change of the live run folder and for every answered request.
 """
 
-import argparse
 import fcntl
 import gc
 import json
@@ -24,7 +20,7 @@ import signal
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from hashlib import blake2b
@@ -53,7 +49,7 @@ from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SNAPSHOT, SharedFiles
 from fcslam.service.shared.mission_tables import Lease, LeaseLostError, MissionTables
-from fcslam.service.supervisor import PROGRESS, READY, STAGES, STANDBY
+from fcslam.service.supervisor import PROGRESS, READY, STAGES, WorkerTask
 from fcslam.storage.postgres import Postgres
 from fcslam.storage.state_file import code_version, read_state, write_state
 from fcslam.warmup import warm_up_fleet
@@ -480,7 +476,7 @@ def _chained(before: bytes, data: bytes) -> bytes:
     return blake2b(before + data, digest_size=16).digest()
 
 
-def main(arguments: Sequence[str]) -> int:
+def main() -> int:
     """Work until stdin ends."""
     # The service stops first, which ends stdin. It also sends a signal, so nobody has to wait for a compiler.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -491,13 +487,13 @@ def main(arguments: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
-    if arguments == [STANDBY] and not (arguments := _sent_arguments()):
+    task = _task()
+    if task is None:
         return 0
-    given = _parsed(arguments)
-    folder = MissionFolder(given.folder)
-    look_s = math.inf if given.store is None else SHARED_LOOK_S
-    alone, mission = _alone(folder), _mission(folder, given.store, given.lease)
-    with verifying(given.workers, must_connect=False) as verify_pairs, mission as (store, share):
+    folder = MissionFolder(Path(task.folder))
+    look_s = math.inf if task.store is None else SHARED_LOOK_S
+    alone, mission = _alone(folder), _mission(folder, task)
+    with verifying(task.workers, must_connect=False) as verify_pairs, mission as (store, share):
         try:
             worker = Worker(folder, store, time.monotonic, emit_event, start_copy, verify_pairs, share)
             emit_event(READY, None)
@@ -514,39 +510,28 @@ def main(arguments: Sequence[str]) -> int:
         return 0
 
 
-def _sent_arguments() -> list[str]:
-    """The arguments of a standby worker, a line of JSON that comes when there is a mission for it; empty: none came."""
+def _task() -> WorkerTask | None:
+    """The task, which may come late; None: stdin ended before."""
     line = b""
     while not line.endswith(b"\n"):
         byte = os.read(sys.stdin.fileno(), 1)
         if not byte:
-            return []
+            return None
         line += byte
-    return [str(argument) for argument in json.loads(line)]
+    return WorkerTask(**json.loads(line))
 
 
 @contextmanager
-def _mission(
-    folder: MissionFolder, url: str | None, lease: Sequence[int] | None
-) -> Iterator[tuple[MissionStore, Share]]:
+def _mission(folder: MissionFolder, task: WorkerTask) -> Iterator[tuple[MissionStore, Share]]:
     """The mission of a file, or of a server to which the worker has a lease."""
-    if url is None or lease is None:
+    if task.store is None or task.lease is None:
         yield MissionStore(folder.store), lambda *_: None
         return
-    with closing(Postgres(url, f"worker of {folder.name}")) as server:
-        held = Lease(*lease)
+    with closing(Postgres(task.store, f"worker of {folder.name}")) as server:
+        held = Lease(*task.lease)
         files = SharedFiles(server, held)
         files.fetch_snapshot(folder)
         yield MissionStore(MissionTables(server, held.mission, held)), files.put
-
-
-def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--store")
-    parser.add_argument("--lease", type=int, nargs=2, metavar=("MISSION", "FENCE"))
-    parser.add_argument("--workers", default="1")
-    return parser.parse_args(arguments)
 
 
 def _alone(folder: MissionFolder) -> IO[str]:
@@ -560,4 +545,4 @@ def _alone(folder: MissionFolder) -> IO[str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())
