@@ -26,7 +26,7 @@ class JointGraph:
     """Grows with the packets; poses of robots in different maps are each in their own map's frame."""
 
     def __init__(self, stages: StageTimes | None = None) -> None:
-        self._stages = stages or StageTimes()
+        self.stages = stages or StageTimes()
         self.graph = PoseGraph()
         self._factors = FactorCache(self.graph)
         self._variables: dict[str, Rows[np.int64]] = {}
@@ -127,7 +127,7 @@ class JointGraph:
 
     def optimize(self) -> None:
         """Quick solve (Levenberg-Marquardt with a Cauchy loss on closures) of the maps whose closures changed."""
-        with self._stages.measure("solve"):
+        with self.stages.measure("solve"):
             start, kept, edges, changed = self._poses.values, self._kept(), self.graph.arrays(), list(self._changed)
             component = self.graph.components(kept)
             solved = np.isin(component, component[np.concatenate((edges.i[changed], edges.j[changed]))])

@@ -45,12 +45,13 @@ def reevaluate(
     def compare_pair(a: int, b: int, poses_a: FloatArray, poses_b: FloatArray) -> MapFit:
         return compare((robots[a], robots[b]), poses_a, poses_b)
 
-    solution = solve_jointly(
-        _evidence(graph, entries),
-        settings,
-        examine=examine_pair,
-        compare=compare_pair,
-    )
+    with graph.stages.measure("solve"):
+        solution = solve_jointly(
+            _evidence(graph, entries),
+            settings,
+            examine=examine_pair,
+            compare=compare_pair,
+        )
     graph.take(solution.poses)
     reasons = _reasons(solution, robots)
     clusters = {edge: len(link.members) for link in solution.joining for edge in link.members.tolist()}

@@ -182,7 +182,7 @@ def test_missions_are_spread_and_those_of_an_instance_that_ends_or_dies_are_take
     end_leases(postgres, "one")
     three, of_three = instance(postgres, "three")
     three.start()
-    until(lambda: list(held(registry).values()) == ["three"] * 6)
+    until(lambda: list(held(registry).values()) == ["three"] * 6 and len(of_three) == 6)
     assert {worker.lease.fence for worker in of_three} >= {2}
     three.close()
 
