@@ -111,32 +111,11 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_p
 
 
 @pytest.mark.training
-def test_arms_and_robots_alone_may_have_fewer_seeds(finished, robots, tmp_path):
-    with_shapes(finished, tmp_path)
-    arms = {"median": Arm(settings={"strategy": "fedmedian"}, seeds=1)}
-    found = run_study(study(robots, tmp_path, arms=arms, local_seeds=1))
-    shapes = {name: values.shape[:2] for name, values in found.measured.items()}
-    assert shapes == {"start": (1, 1), "central": (2, 1), "local": (1, 2), "alone": (1, 2), "median": (1, 1)}
-
-
-@pytest.mark.training
 def test_robots_own_networks_share_the_pairs_out(finished):
     local = finished[1].measured["local"]
     shown = np.isfinite(local[..., 0])
     assert (shown.sum(axis=1) == 1).all()
     assert (shown.sum(axis=0) == 1).all()  # over two seeds each of both networks sees each pair once
-
-
-@pytest.mark.training
-def test_all_begin_from_the_start_that_is_named(finished, robots, tmp_path):
-    folder, first = finished
-    seen = set()
-    changes = {"seeds": 1, "arms": {"averaged": Arm()}, "start": folder / "shapes" / "checkpoint.npz"}
-    again = run_study(study(robots, tmp_path, lambda name, *_: seen.add(name), **changes))
-    assert "shapes" not in seen
-    assert all(
-        np.array_equal(first.measured[name][:1], again.measured[name], equal_nan=True) for name in again.measured
-    )
 
 
 @pytest.mark.training
@@ -189,22 +168,6 @@ def findings(central, federated, local):
     return StudyResults(("north", "south"), owners, measured)
 
 
-def test_an_arm_of_fewer_seeds_is_compared_with_those():
-    rng = np.random.default_rng(3)
-    central = rng.random(60)
-    whole = findings(central, central - 0.1, [central - 0.2, central - 0.2])
-    later = findings(central + 0.5, central, [central - 0.2, central - 0.2]).measured
-    measured = {name: np.concatenate((whole.measured[name], later[name])) for name in ("central", "local", "alone")}
-    measured |= {"federated": whole.measured["federated"], "poor": whole.measured["federated"] - 0.03}
-    found = StudyResults(whole.robots, whole.owners, measured)
-    rows = {row.arm: row for row in report(found) if row.measure == MEASURES[0]}
-    assert rows["federated"].gap.mean == pytest.approx(0.1)
-    assert rows["federated"].closed == pytest.approx(0.5)
-    assert rows["local"].gap.mean == pytest.approx(0.45)
-    against = {row.arm: row for row in report(found, against="federated") if row.measure == MEASURES[0]}
-    assert against["poor"].gap == pytest.approx((0.03, 0.03, 0.03))
-
-
 def test_gaps_are_paired_and_the_worst_robot_is_named():
     rng = np.random.default_rng(1)
     hard = rng.random(400)
@@ -219,13 +182,6 @@ def test_gaps_are_paired_and_the_worst_robot_is_named():
     assert rows["federated"].closed_alone == pytest.approx((0.4 - 0.02) / 0.4)
     assert rows["local"].mean == pytest.approx(hard.mean() - 0.2)
     assert rows["local"].closed == pytest.approx(0.0)
-
-
-def test_nothing_is_closed_where_central_is_no_better():
-    rng = np.random.default_rng(2)
-    central = rng.random(50)
-    rows = report(findings(central, central, [central + 0.01 * rng.normal(size=50)]))
-    assert all(np.isnan(row.closed) for row in rows)
 
 
 @pytest.mark.parametrize("poison", ["flipped", "scaled", "reversed", "random", "nan"])

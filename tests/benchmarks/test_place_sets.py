@@ -141,10 +141,3 @@ def test_a_sequence_with_depth(tmp_path):
     assert [tuple(pair) for pair in np.argwhere(found.admitted)] == [(3, 0), (4, 0), (4, 1)]
     assert [tuple(pair) for pair in np.argwhere(truth.matches)] == [(4, 0), (4, 1)]
     assert [tuple(pair) for pair in np.argwhere(truth.different)] == [(3, 0)]
-
-
-def test_images_whose_pose_is_not_known_are_left_out(tmp_path):
-    folder = sequence(tmp_path / "robot_1", [0.0, 0.0, 0.0])
-    kept = (folder / "groundtruth.txt").read_text(encoding="utf-8").splitlines()[:5]
-    (folder / "groundtruth.txt").write_text("\n".join(kept), encoding="utf-8")
-    assert len(read_place_set(folder).queries) == 2
