@@ -56,13 +56,6 @@ def test_a_file_overrides_only_what_it_names(tmp_path):
     assert load(Outer, tmp_path / "c.yaml") == Outer()
 
 
-def test_a_gate_keeps_the_thresholds_that_a_file_does_not_name():
-    content = {"fleet": {"matcher": {"verification": {"loose": {"count": 41}}}}}
-    gate = parse(MissionConfig, content, "robot.yaml").fleet.matcher.verification.loose
-    default = MissionConfig().fleet.matcher.verification.loose
-    assert gate == default.model_copy(update={"count": 41}) != default
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [

@@ -239,8 +239,8 @@ def test_the_rules_for_files_symbols_and_settings():
     ]
     assert missing_symbols("`similarity` in `places/similarity.py`") == []
     assert missing_symbols("`sameness` in `places/similarity.py`") == ["sameness in places/similarity.py"]
-    assert is_setting("fleet.consistency.lead")
-    assert not is_setting("fleet.consistency.leader")
+    assert is_setting("fleet.consistency.separation_m")
+    assert not is_setting("fleet.consistency.separation")
 
 
 MESSAGE = re.compile(r"^\| `([^`]+)` \|", re.MULTILINE)

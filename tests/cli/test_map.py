@@ -274,7 +274,7 @@ def test_two_recordings_of_one_name_are_refused(tmp_path, log, capsys):
         ("fleet: 3", "fleet"),
         ("- 1\n- 2", "expected a mapping"),
         ("{", "not valid YAML"),
-        ("fleet: {sight_m: .nan}", "sight_m"),
+        ("fleet: {consistency: {separation_m: .nan}}", "separation_m"),
         ("\x00", "YAML"),
     ],
 )

@@ -5,7 +5,6 @@ import pytest
 
 from fcslam.cloud.manual_closures import measured
 from fcslam.geometry import se2
-from fcslam.lidar.verification import VERIFICATION
 from fcslam.records import ManualClosure
 from tests.lidar.test_submap_verification import EAST, WEST
 from tests.lidar.worlds import other_room, room, scan_at
@@ -30,7 +29,7 @@ def test_walls_that_fit_within_the_tolerance_refine_it(walls, tolerance, is_refi
     truth = se2.between(at_i, at_j)
     given = se2.compose(truth, OFF)
     made = ManualClosure("a", 0.0, "b", 0.0, tuple(given.tolist()), tolerance)
-    T_i_j, information = measured(made, i, j, VERIFICATION)
+    T_i_j, information = measured(made, i, j)
     off_m = np.hypot(*se2.between(truth, T_i_j)[:2])
     if is_refined:
         assert off_m < 0.03
@@ -41,4 +40,4 @@ def test_walls_that_fit_within_the_tolerance_refine_it(walls, tolerance, is_refi
 
 def test_ends_that_saw_nothing_keep_the_pose_of_the_user():
     made = ManualClosure("a", 0.0, "b", 0.0, OFF, (0.5, 0.1))
-    assert measured(made, [], [], VERIFICATION)[0] == pytest.approx(OFF)
+    assert measured(made, [], [])[0] == pytest.approx(OFF)

@@ -41,7 +41,7 @@ def test_each_lack_has_its_reason_numbers_and_setting():
         replace(unique, closures=2): Reason(ReasonCode.FEW_CLOSURES, 2, 3, "minimum_closures"),
         replace(SPOT, informative=0): Reason(ReasonCode.NOT_INFORMATIVE, 146),
         replace(SPOT, informative=0, fit=fit(1.5)): Reason(ReasonCode.NOT_INFORMATIVE, 146),
-        replace(SPOT, rival_closures=100): Reason(ReasonCode.NO_LEAD, 1.46, 2.0, "lead"),
+        replace(SPOT, rival_closures=100): Reason(ReasonCode.NO_LEAD, 1.46, 2.0),
         replace(SPOT, rival_places=2): Reason(ReasonCode.RIVAL_PLACES, 1, 2),
         SPOT: Reason(ReasonCode.FEW_PLACES, 1, 3.0, "minimum_evidence"),
         replace(SPOT, fit=fit(1.25)): Reason(ReasonCode.NOT_UNIQUE, 1.25, 2.0, "minimum_evidence"),

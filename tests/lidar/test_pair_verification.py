@@ -20,7 +20,7 @@ from fcslam.lidar.pair_verification import Pair, VerificationPool, verify_here
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.submap_bytes import read_submap, submap_bytes
-from fcslam.lidar.verification import VerificationConfig
+from fcslam.lidar.verification import Gate, VerificationConfig
 from tests import small_fleet
 from tests.small_fleet import fingerprint, in_order
 
@@ -120,7 +120,7 @@ def test_a_pool_finds_what_is_found_here(pairs, workers, pool):
     """The limits are such that the noise of the submaps, which its processes do not know, decides some pairs."""
     asked = []
     noisy = [pair._replace(noise=lambda: asked.append(1) or 0.5) for pair in pairs]
-    config = VerificationConfig(strict={"violation": 0.02, "explained": 0.2, "count": 10})
+    config = VerificationConfig(strict=Gate(explained=0.2, violation=0.02, count=10, overlap=0.25))
     expected = written(verify_here(noisy, config))
     assert 0 < len(asked) < len(pairs)
     verify = pool(workers)

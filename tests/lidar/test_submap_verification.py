@@ -164,14 +164,12 @@ def test_a_submap_of_a_noisy_scanner_contradicts_itself():
 
 def test_a_noisy_scanner_is_allowed_more_violation_and_no_scanner_much():
     free = Agreement(0.9, 0.08, 600, 0.9, 100.0 * np.eye(3))
-    limits = {
-        noise: _shortfall(free, CONFIG.strict, "strict", lambda noise=noise: noise) for noise in (0.0, 0.07, 0.09, 1.0)
-    }
-    assert limits[0.0] == Reason(ReasonCode.IN_FREE_SPACE, 0.08, 0.05, "strict.violation")
-    assert limits[0.07] == Reason(ReasonCode.IN_FREE_SPACE, 0.08, 0.07, "strict.violation")
+    limits = {noise: _shortfall(free, CONFIG.strict, lambda noise=noise: noise) for noise in (0.0, 0.07, 0.09, 1.0)}
+    assert limits[0.0] == Reason(ReasonCode.IN_FREE_SPACE, 0.08, 0.05)
+    assert limits[0.07] == Reason(ReasonCode.IN_FREE_SPACE, 0.08, 0.07)
     assert limits[0.09] is None
     much = replace(free, violation=0.11)
-    assert _shortfall(much, CONFIG.strict, "strict", lambda: 1.0) is not None
+    assert _shortfall(much, CONFIG.strict, lambda: 1.0) is not None
 
 
 @pytest.mark.parametrize(("violation", "predicted"), [(0.08, False), (0.15, True)])

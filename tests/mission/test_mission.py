@@ -147,7 +147,7 @@ def test_the_run_carries_its_configuration(run):
 
 
 def test_the_settings_of_the_cloud_go_into_a_mission_and_out_of_it():
-    given = MissionConfig.model_validate({"seed": 3, "fleet": {"sight_m": 5.0}, "map": {"resolution_m": 0.1}})
+    given = MissionConfig.model_validate({"seed": 3, "fleet": {"solve_every": 5}, "map": {"resolution_m": 0.1}})
     kept = replace(EMPTY, config=given.cloud)
     assert continued_config(kept) == given
 

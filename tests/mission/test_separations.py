@@ -49,7 +49,7 @@ def test_maps_that_were_not_to_be_joined_need_no_reason():
 
 
 def test_maps_of_several_robots_take_the_strongest_pair():
-    other = Reason(ReasonCode.NO_LEAD, 1.2, 2, "lead")
+    other = Reason(ReasonCode.NO_LEAD, 1.2, 2)
     run = run_of(
         {"a": 0, "b": 0, "c": 1},
         ("a", "c", ClosureStatus.REJECTED, other),

@@ -1,5 +1,7 @@
 """Place in, M_ij out: words or nearness propose, the submaps decide."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from fcslam.features.birdseye import describe
 from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import verify_here
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.verification import NO_PRIOR, Gate, LooseGate, VerificationConfig
+from fcslam.lidar.verification import NO_PRIOR, VERIFICATION
 from fcslam.places import matcher as matcher_module
 from fcslam.places import motions
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
@@ -127,12 +129,13 @@ def test_a_wrong_prediction_does_not_become_a_closure(visits):
     assert match.reason.code is not ReasonCode.VERIFIED
 
 
-def test_a_known_start_needs_fewer_points(visits):
+def test_a_known_start_needs_fewer_points(visits, monkeypatch):
     truth = se2.between(POSE_A, POSE_B)
     first, second = visits.visit("a", 0, room(), POSE_A), visits.visit("b", 0, room(), POSE_B)
     for count, is_match in ((700, True), (3000, False)):  # a third of them is enough
-        gates = VerificationConfig(strict=Gate(count=count), loose=LooseGate(count=count))
-        matcher = visits.matcher(verification=gates)
+        strict, loose = (replace(gate, count=count) for gate in (VERIFICATION.strict, VERIFICATION.loose))
+        monkeypatch.setattr("fcslam.places.matcher.VERIFICATION", replace(VERIFICATION, strict=strict, loose=loose))
+        matcher = visits.matcher()
         matcher.match(first, {}, STRANGERS)
         found = matcher.match_at(second, {first.id: se2.compose(truth, (0.2, -0.2, 0.05))})
         assert [match.M for match in found] == [True] * is_match

@@ -147,7 +147,7 @@ class ClosureDecisions:
         """
         for made in self._missing(final):
             i, j = self._ends(made)
-            T_i_j, information = measured(made, self._scans(i), self._scans(j), self._config.matcher.verification)
+            T_i_j, information = measured(made, self._scans(i), self._scans(j))
             self._mark(self.closures.add_by_hand(made, i, j, T_i_j, information))
         fusion = reevaluate(
             self._graph,

@@ -38,6 +38,8 @@ class VocabularyState(NamedTuple):
 _VocabularyKey = tuple[Channel, str, str]
 """Channel, detector version and floor; places that differ in one of these are never compared."""
 
+SIGHT_M = 6.0
+"""Largest distance at which places in the same map are compared."""
 START_SIGMAS = 3.0
 """A closure within so many standard deviations of the known starts agrees with them."""
 _NO_PLACES = np.empty((0, 2), np.int64)
@@ -173,7 +175,7 @@ class PlaceRecognition:
             if session == place.id.robot or not len(numbers):
                 continue
             poses = self._graph.trajectory(session, numbers)
-            found = visits_near(session, numbers, poses, pose[:2], self._config.sight_m)
+            found = visits_near(session, numbers, poses, pose[:2], SIGHT_M)
             if found:
                 visits.setdefault(robot_of(session), []).extend(found)
         chosen = worth_comparing(visits, self._closures_near(visits), NEAR_VISITS)
@@ -196,7 +198,7 @@ class PlaceRecognition:
                 continue
             T_start_i = dict(zip(numbers.tolist(), self._from_start(session, numbers), strict=True))
             T_start_j = se2.compose(T_starts, T_start_place)
-            visits = visits_near(session, numbers, np.array([*T_start_i.values()]), T_start_j[:2], self._config.sight_m)
+            visits = visits_near(session, numbers, np.array([*T_start_i.values()]), T_start_j[:2], SIGHT_M)
             nearest = [visit.nearest for visit in sorted(visits, key=attrgetter("distance_m"))]
             expected = {i: se2.between(T_start_i[i.number], T_start_j) for i in nearest[:NEAR_VISITS]}
             for match in self._matcher(key).match_at(place, expected):

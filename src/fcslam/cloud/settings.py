@@ -32,9 +32,6 @@ class FleetConfig(Settings):
         default=FusionStrategy.JOINT,
         description="how maps are fused: joint (one robust graph), or two_point (rigid maps, as in the paper)",
     )
-    sight_m: float = Field(
-        default=6.0, gt=0, description="largest distance, in metres, at which places in the same map are compared"
-    )
     solve_every: int = Field(
         default=40,
         gt=0,

@@ -10,7 +10,7 @@ from fcslam.geometry import se2
 from fcslam.geometry.alignment import two_point_alignment
 from fcslam.graph.clique import maximum_clique
 from fcslam.graph.consistency import Closures, ConsistencySettings, pairwise_consistency
-from fcslam.graph.evidence import ClusterEvidence, MapFit, refutation, shortfall
+from fcslam.graph.evidence import LEAD, ClusterEvidence, MapFit, refutation, shortfall
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray, Reason, ReasonCode
 
@@ -194,7 +194,7 @@ def dominant_cluster(
         if by_count is not None and by_count.code not in _MAPS_DECIDE:
             return evidence, by_count
         fit = examine(rows)
-        lead = evidence.closures - settings.lead * evidence.rival_closures
+        lead = evidence.closures - LEAD * evidence.rival_closures
         if fit is not None and (lead < 0.0 or evidence.separate_places < evidence.rival_places):
             rival = examine(rivals)
             if rival is None:

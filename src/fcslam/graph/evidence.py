@@ -35,6 +35,8 @@ LEAST_RATIO = 1.2
 """Least ratio of the support to that of a transform elsewhere, however many places agree."""
 FIXES_RATIO = 2.0
 """Least ``MapFit.ratio`` of maps that fix the pose where no closure does."""
+LEAD = 2.0
+"""Least ratio of the closures of a cluster to those of the largest one that contradicts it."""
 RATIO_PLACES = 2.0
 """Further places that maps replace which fit twice as well as elsewhere, and as well as those of one place do."""
 TAG_PLACES = 2.0
@@ -52,11 +54,6 @@ class EvidenceSettings(Settings):
         ge=0.0,
         description="evidence that a cluster needs to join two maps: its separate places, plus twice the ratio by "
         "which the maps fit better than elsewhere, less one",
-    )
-    lead: float = Field(
-        default=2.0,
-        ge=1.0,
-        description="least ratio of sizes, of the largest cluster to the largest one that contradicts it",
     )
 
 
@@ -129,9 +126,9 @@ def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason |
     fit = evidence.fit
     if fit is not None and fit.is_compared:
         is_clear = fit.likeness >= CLEAR_LIKENESS and evidence.separate_places >= settings.minimum_evidence
-        outnumbered = None if is_clear else _lead_shortfall(evidence, settings)
+        outnumbered = None if is_clear else _lead_shortfall(evidence)
         return refutation(fit) or _pose_shortfall(evidence) or outnumbered or _amount_shortfall(evidence, settings)
-    return _pose_shortfall(evidence) or _lead_shortfall(evidence, settings) or _amount_shortfall(evidence, settings)
+    return _pose_shortfall(evidence) or _lead_shortfall(evidence) or _amount_shortfall(evidence, settings)
 
 
 def _pose_shortfall(evidence: ClusterEvidence) -> Reason | None:
@@ -140,9 +137,9 @@ def _pose_shortfall(evidence: ClusterEvidence) -> Reason | None:
     return Reason(ReasonCode.NOT_INFORMATIVE, evidence.closures)
 
 
-def _lead_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
-    if evidence.closures < settings.lead * evidence.rival_closures:
-        return Reason(ReasonCode.NO_LEAD, evidence.closures / evidence.rival_closures, settings.lead, "lead")
+def _lead_shortfall(evidence: ClusterEvidence) -> Reason | None:
+    if evidence.closures < LEAD * evidence.rival_closures:
+        return Reason(ReasonCode.NO_LEAD, evidence.closures / evidence.rival_closures, LEAD)
     if evidence.separate_places < evidence.rival_places:
         return Reason(ReasonCode.RIVAL_PLACES, evidence.separate_places, evidence.rival_places)
     return None

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 
-from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.information import limited_information
 from fcslam.lidar.matching import match_scan
@@ -34,56 +32,34 @@ CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD = 0.03, 0.006
 LEAST_VARIANCE = CLOSURE_SIGMA_M**2, CLOSURE_SIGMA_M**2, CLOSURE_SIGMA_RAD**2
 
 
-class Gate(Settings):
-    """Thresholds for two submaps to show the same place where no estimate predicts it."""
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """Thresholds for two submaps to show the same place."""
 
-    explained: float = Field(
-        default=0.80,
-        ge=0,
-        le=1,
-        description="least share of the points in known area that lie on a surface, in either direction",
-    )
-    violation: float = Field(
-        default=0.05,
-        ge=0,
-        le=1,
-        description="largest share of the points in known area that lie in the other submap's free space",
-    )
-    count: int = Field(default=250, ge=0, description="least number of points on a surface; points are 0.1 m apart")
-    overlap: float = Field(default=0.25, ge=0, le=1, description="least share of all points that lie in known area")
+    explained: float
+    """Least share of the points in known area that lie on a surface, in either direction."""
+    violation: float
+    """Largest share of the points in known area that lie in the other submap's free space."""
+    count: int
+    """Least number of points on a surface; points are 0.1 m apart."""
+    overlap: float
+    """Least share of all points that lie in known area."""
 
 
-class LooseGate(Gate):
-    """Thresholds where an estimate predicts the closure."""
-
-    explained: float = Field(
-        default=0.70,
-        ge=0,
-        le=1,
-        description="least share of the points in known area that lie on a surface, in either direction",
-    )
-    violation: float = Field(
-        default=0.10,
-        ge=0,
-        le=1,
-        description="largest share of the points in known area that lie in the other submap's free space",
-    )
-
-
-PARTIAL = Gate(explained=0.65, violation=0.22, count=500, overlap=0.5)
-"""Gate of a partially supported closure: much overlap, but bent submaps (outdoors, on a slope). It counts half in a
-cluster, and never alone."""
-
-
-class VerificationConfig(Settings):
+@dataclass(frozen=True, slots=True)
+class VerificationConfig:
     """Verification of closures between submaps, aligned in both directions."""
 
-    strict: Gate = Field(default=Gate(), description="thresholds where no estimate predicts the closure")
-    loose: LooseGate = Field(default=LooseGate(), description="thresholds where an estimate predicts the closure")
+    strict: Gate = Gate(explained=0.80, violation=0.05, count=250, overlap=0.25)
+    """Where no estimate predicts the closure."""
+    loose: Gate = Gate(explained=0.70, violation=0.10, count=250, overlap=0.25)
+    """Where an estimate predicts it."""
 
 
 VERIFICATION = VerificationConfig()
-"""Thresholds for closures of one robot."""
+PARTIAL = Gate(explained=0.65, violation=0.22, count=500, overlap=0.5)
+"""Gate of a partially supported closure: much overlap, but bent submaps (outdoors, on a slope). It counts half in a
+cluster, and never alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +80,7 @@ class Verification:
     informative: bool
     """Whether it fixes the pose in every direction."""
     reason: Reason
-    """Why it is not strict and informative, or that it is verified; settings as in ``VerificationConfig``."""
+    """Why it is not strict and informative, or that it is verified."""
     loose_reason: Reason
     """The same for the loose gate."""
 
@@ -203,15 +179,15 @@ def judge(
         noise = no_noise  # it takes two submaps, and decides nothing
     informative = weakest >= INFORMATIVE
     one_direction = Reason(ReasonCode.ONE_DIRECTION, weakest, INFORMATIVE)
-    strict = _shortfall(worse, config.strict, "strict", no_noise if predicted else noise)
-    loose = _shortfall(worse, config.loose, "loose", noise if predicted else no_noise)
+    strict = _shortfall(worse, config.strict, no_noise if predicted else noise)
+    loose = _shortfall(worse, config.loose, noise if predicted else no_noise)
     return Verification(
         T_a_b=aligned.T_a_b,
         information=aligned.information,
         worse=worse,
         strict=symmetric and not strict,
         loose=symmetric and not loose,
-        partial=symmetric and informative and not _shortfall(worse, PARTIAL, "partial", no_noise),
+        partial=symmetric and informative and not _shortfall(worse, PARTIAL, no_noise),
         informative=informative,
         reason=asymmetric or strict or (_VERIFIED if informative else one_direction),
         loose_reason=asymmetric or loose or _VERIFIED,
@@ -232,16 +208,16 @@ def _asymmetry(gap: FloatArray) -> Reason | None:
     return None
 
 
-def _shortfall(found: Agreement, gate: Gate, name: str, noise: Callable[[], float]) -> Reason | None:
-    """The first threshold of the gate called ``name`` that is not reached."""
+def _shortfall(found: Agreement, gate: Gate, noise: Callable[[], float]) -> Reason | None:
+    """The first threshold of the gate that is not reached."""
     if found.explained < gate.explained:
-        return Reason(ReasonCode.NOT_ENOUGH_EXPLAINED, found.explained, gate.explained, f"{name}.explained")
+        return Reason(ReasonCode.NOT_ENOUGH_EXPLAINED, found.explained, gate.explained)
     if found.violation > gate.violation and found.violation > (limit := _noisy_limit(found, gate, noise)):
-        return Reason(ReasonCode.IN_FREE_SPACE, found.violation, limit, f"{name}.violation")
+        return Reason(ReasonCode.IN_FREE_SPACE, found.violation, limit)
     if found.count < gate.count:
-        return Reason(ReasonCode.FEW_POINTS, found.count, gate.count, f"{name}.count")
+        return Reason(ReasonCode.FEW_POINTS, found.count, gate.count)
     if found.overlap < gate.overlap:
-        return Reason(ReasonCode.LITTLE_OVERLAP, found.overlap, gate.overlap, f"{name}.overlap")
+        return Reason(ReasonCode.LITTLE_OVERLAP, found.overlap, gate.overlap)
     return None
 
 

@@ -18,7 +18,7 @@ from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
 from fcslam.lidar.submap import Submap, agreement
-from fcslam.lidar.verification import NO_PRIOR, Verification, VerificationConfig
+from fcslam.lidar.verification import NO_PRIOR, VERIFICATION, Verification
 from fcslam.places.index import PlaceIndex, QueryResult
 from fcslam.places.motions import Motion, propose_motions
 from fcslam.places.similarity import PAPER_SCALE
@@ -97,7 +97,6 @@ class MatcherConfig(Settings):
         default=2.0, gt=0.0, description="side of the squares of the map in which the number of places is limited [m]"
     )
     vocabulary: VocabularyConfig = Field(default=VocabularyConfig(), description="dynamic vocabulary")
-    verification: VerificationConfig = Field(default=VerificationConfig(), description="verification of closures")
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +130,7 @@ class PlaceMatch(LoopClosure):
             T_i_j=frozen(check.T_a_b),
             information=frozen(check.information),
             status=_status(check.loose if predicted else check.strict),
-            reason=(check.loose_reason if predicted else check.reason).under("verification"),
+            reason=check.loose_reason if predicted else check.reason,
             informative=check.informative,
             explained=check.worse.explained,
             predicted=predicted,
@@ -242,9 +241,9 @@ class PlaceMatcher:
         """
         kept = [(i, T_i_j) for i, T_i_j in expected.items() if i in self._places]
         pairs = [self._pair(i, place, Motion(T_i_j, NO_PRIOR, 0.0), predicted=True) for i, T_i_j in kept]
-        loose = self._config.verification.loose
-        fewer = loose.model_copy(update={"count": round(START_SHARE * loose.count)})
-        checks = self._verify_pairs(pairs, self._config.verification.model_copy(update={"loose": fewer}))
+        loose = VERIFICATION.loose
+        fewer = replace(loose, count=round(START_SHARE * loose.count))
+        checks = self._verify_pairs(pairs, replace(VERIFICATION, loose=fewer))
         matches = [
             PlaceMatch.verified(i, place.id, place.channel, 0.0, check, predicted=True)
             for (i, _), check in zip(kept, checks, strict=True)
@@ -398,7 +397,7 @@ class PlaceMatcher:
             for comparison in comparisons
             for guess in comparison.guesses
         ]
-        checks = iter(self._verify_pairs(pairs, self._config.verification))
+        checks = iter(self._verify_pairs(pairs, VERIFICATION))
         matches: list[PlaceMatch] = []
         for comparison in comparisons:
             found = [next(checks) for _ in comparison.guesses]
