@@ -6,6 +6,7 @@ To map with it, set `robot.views.weights` to the file. This one knows contrast a
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -33,7 +34,6 @@ if __name__ == "__main__":
     network = make_model(graph, opset_imports=[make_opsetid("", 17)], ir_version=8)
     set_model_props(network, {"fcslam_format": "1", "fcslam_version": "own-1"})  # a new version for new weights
     onnx.save(network, file)
-    features = OnnxDetector(OnnxConfig.model_validate({"weights": file})).detect(
-        np.random.default_rng(1).integers(0, 255, (240, 320), "u1")
-    )
+    image = np.random.default_rng(1).integers(0, 255, (240, 320), "u1")
+    features = OnnxDetector(OnnxConfig(weights=Path(file))).detect(image)
     print(f"{file}: {len(features.scores)} keypoints of {8 * features.descriptors.shape[1]} bits in an image of noise")
