@@ -15,11 +15,11 @@ from fcslam.learning.federated.coordinator import RoundRules
 from fcslam.learning.federated.flower import flower_aggregate
 from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, federate_locally
 from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.trainer import ExecutionOptions
 
-SETTINGS = FederatedSettings.model_validate(
-    {"rounds": 2, "local_steps": 2, "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "label_copies": 1}}
-)
+TRAINING = TrainingSettings(shape_steps=2, pairs=1, side_px=64, label_copies=1)
+SETTINGS = FederatedSettings(rounds=2, local_steps=2, training=TRAINING)
 
 
 class WithoutFurthest(FedAvg):
@@ -34,7 +34,6 @@ class WithoutFurthest(FedAvg):
 
 
 if __name__ == "__main__":
-    rules = RoundRules(flower_aggregate(WithoutFurthest), judge_every=1)
-    job = FederatedJob(Path(sys.argv[1]), SETTINGS, rules=rules)
+    job = FederatedJob(Path(sys.argv[1]), SETTINGS, rules=RoundRules(flower_aggregate(WithoutFurthest)))
     options = ExecutionOptions(validation_pairs=1)
     print(*federate_locally([Path(folder) for folder in sys.argv[2:]], job, options, ProgressCallbacks()), sep="\n")
