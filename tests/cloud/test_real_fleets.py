@@ -4,8 +4,8 @@ import os
 from pathlib import Path
 
 import pytest
+from convert_logs import readable
 
-from benchmarks.convert_logs import readable
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.sources import open_source
 

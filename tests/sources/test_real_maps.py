@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from convert_logs import readable
 
-from benchmarks.convert_logs import readable
 from fcslam.geometry import se2
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import LaserScan

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from convert_logs import readable, records_of
 
-from benchmarks.convert_logs import readable, records_of
 from fcslam.geometry import se2
 from fcslam.records import LaserScan
 from fcslam.sources import open_source
