@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fcslam.cloud.cloud import Cloud
+from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig, FusionStrategy
 from fcslam.errors import InputError, PacketError
@@ -97,17 +98,16 @@ def test_a_vocabulary_that_is_not_there_is_one_line(tmp_path):
         Cloud(fleet_config(tmp_path / "none"), 0)
 
 
-def test_a_restored_cloud_has_the_map_and_goes_on(path):
+def test_a_restored_fleet_has_the_map_and_goes_on(path):
     first = [HELLO, BARE, PLACE, TILE]
     rest = [replace(BARE, id=KeyscanId("a", 1)), motion("a", 0, 1, STEP), replace(TILE, column=1)]
     packets = [Packet("a", 0, number, 10.0, body) for number, body in enumerate([*first, *rest])]
-    cloud = cloud_of(path, *first)
+    fleet = cloud_of(path, *first).fleet
     applied = {PacketNumber("a", packet.sequence): packet for packet in packets[: len(first)]}
-    times = {number: packet.time for number, packet in applied.items()}
-    again = Cloud.restored(fleet_config(path), 0, cloud.state(), times, applied.__getitem__)
+    again = Fleet.restored(fleet_config(path), 0, fleet.state(), applied.__getitem__)
     for packet in packets[len(first) :]:
-        cloud.receive(encode(packet))
-        again.receive(encode(packet))
-    one, other = (each.finalize().robots[0].own_map for each in (cloud, again))
+        fleet.apply(packet)
+        again.apply(packet)
+    one, other = (each.conclude().robots[0].own_map for each in (fleet, again))
     assert one.cells.shape == (256, 512)
     assert np.array_equal(one.cells, other.cells)
