@@ -322,7 +322,8 @@ def watch_files(folder: Path, outside: list[str]) -> None:
             path, writes = arguments[WRITES[event]], arguments[-1] == -1  # else tempfile, which clears its own folder
         else:
             return
-        if not writes or isinstance(path, int):
+        # A file that is opened by the name of its folder has no name, and ends with the process.
+        if not writes or isinstance(path, int) or (event == "open" and os.path.isdir(path)):
             return
         absolute = os.path.normpath(os.path.join(root, os.fsdecode(path)))
         # Compiled code is cached beside its source.

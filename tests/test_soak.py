@@ -1,12 +1,12 @@
 """The short form of benchmarks/soak.py: nothing grows while robots stand, and connections break again and again."""
 
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from common import figures
 
 ROOT = Path(__file__).parents[1]
 
@@ -19,8 +19,8 @@ def test_nothing_grows_while_robots_stand(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
     ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
-    tables = json.loads((tmp_path / "soak_standing.json").read_text())["tables"]
-    first, _, last = tables["Hours"]
+    report = tmp_path / "soak_standing.csv"
+    first, _, last = ({name: float(value) for name, value in row.items()} for row in figures(report, "Hours"))
     assert first["packets"] == last["packets"] > 100
     assert last["connections"] >= first["connections"] + 10
-    assert len(tables["Growth of each process"]) == 6
+    assert len(figures(report, "Growth of each process")) == 6
