@@ -95,7 +95,7 @@ def read_request(data: bytes) -> TrainingRequest:
             header["lesson"],
             settings,
         )
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise TrainingError(
             f"the server's request cannot be read ({error}); install the same version of fcslam on both machines"
         ) from error

@@ -22,7 +22,9 @@ class Tape:
     def __init__(self) -> None:
         self._file = TemporaryFile(prefix="fcslam-")  # noqa: SIM115  it lives as long as the tape
         finalize(self, self._file.close)
-        self._topics, self._times_ns, self._ends = array("L"), array("q"), array("q")
+        self._topics, self._ends = array("L"), array("q")
+        self._times_ns: list[int] = []
+        """Of a damaged bag, some are larger than a 64-bit integer."""
         self._size = 0
 
     def add(self, topic: int, time_ns: int, content: Content) -> None:
