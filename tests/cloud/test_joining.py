@@ -140,3 +140,11 @@ def test_a_solve_is_of_the_maps_whose_closures_changed_also_after_a_restart(tmp_
     assert not np.allclose(graph.trajectory("a"), a, atol=1e-3)
     assert np.allclose(graph.trajectory("c"), solved, atol=1e-9)
     assert all(np.array_equal(graph.trajectory(robot), again.trajectory(robot)) for robot in "abc")
+
+
+def test_a_closure_of_the_cameras_says_nothing_of_a_comparison_of_the_lidars():
+    log = ClosureLog()
+    (line,) = closures(("a", POSES), ("b", POSES), [(3, 4)])
+    log.add(PlaceMatch.verified(line.i, line.j, Channel.CAMERA, 0.4, verified(line), predicted=False))
+    assert log.has(line.i, line.j, Channel.CAMERA)
+    assert not log.has(line.i, line.j, Channel.LIDAR)

@@ -80,16 +80,13 @@ class ClosureLog:
 
         The same places seen by another detector are not independent evidence.
         """
-        places = {match.i, match.j}
-        if match.channel is Channel.TAG:  # each is a measurement of its own
-            return False
-        found = (entry.closure for entry in self._at.get(match.j.robot, {}).get(match.j.number, ()))
-        return any({closure.i, closure.j} == places and closure.channel is match.channel for closure in found)
+        # Each sighting of a tag is a measurement of its own.
+        return match.channel is not Channel.TAG and self.has(match.i, match.j, match.channel)
 
-    def has(self, i: KeyscanId, j: KeyscanId) -> bool:
-        """Whether the places of these two keyscans were compared, with a motion between them, before."""
-        entries = self._at.get(j.robot, {}).get(j.number, ())
-        return any({entry.closure.i, entry.closure.j} == {i, j} for entry in entries)
+    def has(self, i: KeyscanId, j: KeyscanId, channel: Channel) -> bool:
+        """Whether the log has a closure between these two places of a channel."""
+        found = (entry.closure for entry in self._at.get(j.robot, {}).get(j.number, ()))
+        return any({closure.i, closure.j} == {i, j} and closure.channel is channel for closure in found)
 
     def add(self, match: PlaceMatch) -> ClosureEntry:
         """Add a match, as verified or, if its verification failed, as a candidate."""

@@ -93,7 +93,7 @@ class PlaceRecognition:
             stored = {s: self._places.get((key, s), _NO_PLACES)[:, 0].tolist() for s in (*a, *b)}
             others = [KeyscanId(session, number) for session in a for number in stored[session]]
             for place in [KeyscanId(session, number) for session in b for number in stored[session]]:
-                new = [i for i in others if not self._closures.has(i, place)]
+                new = [i for i in others if not self._closures.has(i, place, key[0])]
                 yield place.robot, matcher.match_again(place, new)
 
     def thin(self, place: Place, mates: Collection[str]) -> None:

@@ -152,6 +152,7 @@ def solve_jointly(
     links = _find_links(evidence, paths, consistency, examine)
     joining = [link for link in links if link.decision.dominant]
     known = _known_transforms(evidence, paths)
+    _, bound = _merge_frames(len(own), known, ())
     apart: dict[tuple[int, int], Reason] = {}
     senders = evidence.senders or range(len(own))
     while True:
@@ -174,7 +175,6 @@ def solve_jointly(
         # 7. Robots that alone join maps that contradict each other leave them.
         if len(confirmed) == len(joining):
             bridges = _false_bridges(evidence, solution, senders, compare)
-            _, bound = _merge_frames(len(own), known, ())
             apart |= {(a, b): reason for (a, b), reason in bridges.items() if bound[a] != bound[b]}
             confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
         if len(confirmed) == len(joining):
