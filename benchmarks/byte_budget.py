@@ -22,7 +22,7 @@ import numpy as np
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import Track, run_of
 from fcslam.config import dump
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.lab.evaluation.relations import evaluate_relations
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
@@ -91,7 +91,7 @@ def row(robots: dict[str, tuple[RobotFrontend, list[Packet]]], budget_kbps: floa
                 f"{errors.used} of {errors.total}", errors.translation.mean, errors.translation.maximum,
                 errors.rotation.mean,
             )  # fmt: skip
-        except EvaluationError:  # no two robots share a map
+        except InputError:  # no two robots share a map
             measured = ("0", np.nan, np.nan, np.nan)
     sent = sum(len(encode(packet)) for stream in streams for packet in stream)
     seconds = sum(float(np.ptp(track.stamps)) for track in tracks.values())

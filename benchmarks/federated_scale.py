@@ -29,7 +29,7 @@ from typing import Any
 import common
 import numpy as np
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.federated.client import ClientUpdate
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks, RoundRules
 from fcslam.learning.federated.fleet_grid import FleetGrid
@@ -77,10 +77,10 @@ class DrawnRobot:
         return ClientUpdate(drawn_update(request.weights, rng, request.round_number), {"drawn": STEP})
 
     def evaluate(self, _request: TrainingRequest) -> dict[str, float]:
-        raise TrainingError("has no images")
+        raise InputError("has no images")
 
     def judge(self, _request: TrainingRequest) -> Judgement:
-        raise TrainingError("has no images")
+        raise InputError("has no images")
 
 
 def drawn_update(weights: Weights, rng: np.random.Generator, round_number: int) -> dict[str, Any]:
@@ -130,7 +130,7 @@ def one_process(names: list[str], missing: float, settings: FederatedSettings) -
 
 
 def fail(robot: DrawnRobot, _is_silent: bool) -> None:
-    raise TrainingError(f"{robot.name} is missing")
+    raise InputError(f"{robot.name} is missing")
 
 
 def over_a_network(

@@ -155,7 +155,7 @@ def test_a_run_that_was_opened_can_be_saved_again(opened, tmp_path):
     copy = fcslam.open_run(str(tmp_path / "copy"))
     assert copy.map_files == opened.map_files
     assert list(copy.trajectories) == list(opened.trajectories)
-    with pytest.raises(fcslam.OutputError, match="force=True"):
+    with pytest.raises(fcslam.InputError, match="force=True"):
         opened.save(tmp_path / "copy")
     opened.save(tmp_path / "copy", force=True)
 
@@ -216,11 +216,11 @@ def test_settings_come_from_a_model_a_mapping_or_a_file(tmp_path):
         ({"recordings": ["LOG", "TWIN"], "split": 2}, fcslam.SourceError, "cuts one recording"),
         ({"split": 0}, fcslam.SourceError, "0 parts"),
         ({"processes": 0}, fcslam.InputError, "give 1 or more"),
-        ({"config": {"seed": -1}}, fcslam.ConfigError, "seed"),
-        ({"config": {"sed": 1}}, fcslam.ConfigError, "did you mean 'seed'"),
-        ({"config": "none.yaml"}, fcslam.ConfigError, "none.yaml"),
-        ({"vetoes": [fcslam.Veto("nobody", "robot_1")]}, fcslam.ConfigError, "nobody"),
-        ({"output": "LOG"}, fcslam.OutputError, "is not a run folder"),
+        ({"config": {"seed": -1}}, fcslam.InputError, "seed"),
+        ({"config": {"sed": 1}}, fcslam.InputError, "did you mean 'seed'"),
+        ({"config": "none.yaml"}, fcslam.InputError, "none.yaml"),
+        ({"vetoes": [fcslam.Veto("nobody", "robot_1")]}, fcslam.InputError, "nobody"),
+        ({"output": "LOG"}, fcslam.InputError, "is not a run folder"),
         ({"bag_options": fcslam.BagOptions(scan_topics=("/scan",))}, fcslam.SourceError, "ROS bags only"),
     ],
 )

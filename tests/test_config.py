@@ -8,7 +8,7 @@ import yaml
 from pydantic import Field
 
 from fcslam.config import Settings, dump, load, parse, parse_yaml
-from fcslam.errors import ConfigError
+from fcslam.errors import InputError
 from fcslam.mission.mission import MissionConfig
 
 
@@ -69,7 +69,7 @@ def test_a_file_overrides_only_what_it_names(tmp_path):
     ],
 )
 def test_what_does_not_belong_is_named(content, message):
-    with pytest.raises(ConfigError, match="robot") as caught:
+    with pytest.raises(InputError, match="robot") as caught:
         parse(Outer, content, "robot.yaml")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -80,7 +80,7 @@ def test_files_that_are_no_configuration(tmp_path, content):
     path = tmp_path / "c.yaml"
     if content is not None:
         Path(path).write_bytes(content)
-    with pytest.raises(ConfigError, match="yaml: ") as caught:
+    with pytest.raises(InputError, match="yaml: ") as caught:
         load(Outer, path)
     assert "\n" not in str(caught.value)
 
@@ -89,7 +89,7 @@ def test_files_that_are_no_configuration(tmp_path, content):
 def test_a_key_that_is_there_twice_is_refused(tmp_path, content):
     path = tmp_path / "c.yaml"
     path.write_text(content)
-    with pytest.raises(ConfigError, match=r"c\.yaml: not valid YAML \(the key '(seed|robot)' occurs twice"):
+    with pytest.raises(InputError, match=r"c\.yaml: not valid YAML \(the key '(seed|robot)' occurs twice"):
         load(MissionConfig, path)
 
 
@@ -116,5 +116,5 @@ def test_yaml_that_expands_is_refused(text, reason):
     ],
 )
 def test_a_wrong_value_in_python_is_one_line_too(content, reason):
-    with pytest.raises(ConfigError, match=rf"^{reason}$"):
+    with pytest.raises(InputError, match=rf"^{reason}$"):
         Outer(**content)

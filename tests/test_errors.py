@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fcslam.errors import ConfigError, PacketConflictError, UnavailableError
+from fcslam.errors import InputError, PacketConflictError, UnavailableError
 
 
 @pytest.mark.parametrize(
@@ -18,7 +18,7 @@ from fcslam.errors import ConfigError, PacketConflictError, UnavailableError
 def test_a_system_error_stands_without_number_and_without_a_second_file_name(message, readable):
     with pytest.raises(FileNotFoundError) as caught:
         Path("a.yaml").read_text()
-    assert str(ConfigError(message.format(caught.value))) == readable
+    assert str(InputError(message.format(caught.value))) == readable
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
-from fcslam.errors import ConfigError, EditError, PacketError, SourceError
+from fcslam.errors import InputError, PacketError, SourceError
 from fcslam.mission.localization import read_map
 from fcslam.mission.mission_file import edit_mission
 from fcslam.records import LaserScan, ManualClosure
@@ -124,7 +124,7 @@ def test_no_closure_by_hand_joins_floors(mapped):
     run = open_run(whole)
     stamps = [float(run.trajectories[name].stamps[0]) for name in "ac"]
     closure = ManualClosure("a", stamps[0], "c", stamps[1], (0.0, 0.0, 0.0), (0.1, 0.1))
-    with pytest.raises(EditError, match="a and c are on different floors"):
+    with pytest.raises(InputError, match="a and c are on different floors"):
         edit_mission(whole, [closure], "me", 0.0)
 
 
@@ -132,7 +132,7 @@ def test_no_closure_by_hand_joins_floors(mapped):
     ("floors", "reason"), [({"x": "1"}, "a floor names 'x'"), ("first floor", "floor 'first floor' is not 1 to 16")]
 )
 def test_floors_that_cannot_be(logs, floors, reason):
-    with pytest.raises(ConfigError, match=reason):
+    with pytest.raises(InputError, match=reason):
         fcslam.map_recordings(logs[:1], floors=floors)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fcslam.errors import EvaluationError, OutputError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.maps.occupancy_map import OccupancyMap, map_yaml, parse_map, pgm_bytes
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode
@@ -131,7 +131,7 @@ def test_path_length_is_that_of_the_polygon():
 
 def test_a_second_run_needs_force_and_leaves_nothing_of_the_first(tmp_path, run):
     run.save(tmp_path / "run")
-    with pytest.raises(OutputError, match="--force"):
+    with pytest.raises(InputError, match="--force"):
         run.save(tmp_path / "run")
     Run({"other": trajectory("other")}).save(tmp_path / "run", force=True)
     assert [t.robot for t in open_run(tmp_path / "run").trajectories.values()] == ["other"]
@@ -143,7 +143,7 @@ def test_a_second_run_needs_force_and_leaves_nothing_of_the_first(tmp_path, run)
 def test_a_folder_that_is_no_run_is_never_replaced(tmp_path, run, force):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
-    with pytest.raises(OutputError, match="is not a run folder"):
+    with pytest.raises(InputError, match="is not a run folder"):
         run.save(tmp_path / "thesis", force=force)
     assert (tmp_path / "thesis" / "chapter1.tex").read_text() == "years of work"
 
@@ -157,14 +157,14 @@ def test_an_empty_folder_may_be_used(tmp_path, run):
 @pytest.mark.parametrize("where", ["file", "file/below", "/", "/proc/nowhere/run"])
 def test_impossible_places_are_refused_in_one_line(tmp_path, where):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError) as caught:
+    with pytest.raises(InputError) as caught:
         prepare_output(tmp_path / where, force=True)
     assert "\n" not in str(caught.value)
 
 
 def test_the_working_folder_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(OutputError, match="inside it"):
+    with pytest.raises(InputError, match="inside it"):
         prepare_output(Path("."))
 
 
@@ -178,7 +178,7 @@ def test_an_interrupted_writer_leaves_the_place_as_it_was(tmp_path, run, monkeyp
 
     monkeypatch.setattr(module, step, interrupted)
     for place in ("run", "fresh"):
-        with pytest.raises(OutputError if failure is OSError else failure):
+        with pytest.raises(InputError if failure is OSError else failure):
             run.save(tmp_path / place, force=True)
     assert [entry.name for entry in tmp_path.iterdir()] == ["run"]
     assert [t.robot for t in open_run(tmp_path / "run").trajectories.values()] == ["first"]
@@ -202,9 +202,9 @@ def test_the_old_run_comes_back_if_the_last_rename_fails(tmp_path, run, monkeypa
 
 @pytest.mark.parametrize("name", ["", "..", ".hidden", "a/b", "../../etc/passwd", "a\nb", "-"])
 def test_names_that_are_no_file_names_are_refused(tmp_path, name):
-    with pytest.raises(OutputError, match="file name"):
+    with pytest.raises(InputError, match="file name"):
         Run({name: trajectory(name)}).save(tmp_path / "run")
-    with pytest.raises(OutputError, match="file name"):
+    with pytest.raises(InputError, match="file name"):
         Run({}, map_files={name: b""}).save(tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
@@ -217,7 +217,7 @@ def test_the_folder_has_the_permissions_of_any_new_folder(tmp_path, run):
 
 def test_what_is_no_run_folder_is_refused(tmp_path):
     for path in (tmp_path, tmp_path / "missing"):
-        with pytest.raises(EvaluationError, match="not a run folder"):
+        with pytest.raises(InputError, match="not a run folder"):
             open_run(path)
 
 
@@ -254,7 +254,7 @@ def test_a_broken_run_folder_is_refused_in_one_line(tmp_path, run, file, content
         path.unlink()
     else:
         path.write_bytes(content.encode("latin-1"))
-    with pytest.raises(EvaluationError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         open_run(tmp_path / "run")
     assert "\n" not in str(caught.value)
 
@@ -281,7 +281,7 @@ def test_a_comment_as_other_programs_write_it_is_skipped():
      PGM.replace(b"4 7", b"4000000 7000000"), PGM.replace(b"4 7", b"9" * 5000 + b" 7"), PGM.replace(b"255", b"65535")],
 )  # fmt: skip
 def test_a_broken_image_of_a_map_is_refused(pgm):
-    with pytest.raises(EvaluationError, match=r"map\.pgm is broken") as raised:
+    with pytest.raises(InputError, match=r"map\.pgm is broken") as raised:
         parse_map("map.pgm", pgm, DESCRIPTION)
     assert "\n" not in str(raised.value)
 
@@ -296,7 +296,7 @@ def test_a_broken_image_of_a_map_is_refused(pgm):
      DESCRIPTION.replace("0.05", "!!python/object/apply:os.getpid []")],
 )  # fmt: skip
 def test_a_broken_description_of_a_map_is_refused(description):
-    with pytest.raises(EvaluationError, match=r"map\.pgm is broken") as raised:
+    with pytest.raises(InputError, match=r"map\.pgm is broken") as raised:
         parse_map("map.pgm", PGM, description)
     assert "\n" not in str(raised.value)
 
@@ -310,7 +310,7 @@ def test_a_broken_description_of_a_map_is_refused(description):
 )  # fmt: skip
 def test_the_message_names_the_key_that_is_wrong(old, new, message):
     assert old in DESCRIPTION
-    with pytest.raises(EvaluationError, match=re.escape(message)):
+    with pytest.raises(InputError, match=re.escape(message)):
         parse_map("map.pgm", PGM, DESCRIPTION.replace(old, new))
 
 
@@ -319,7 +319,7 @@ def test_yaml_reads_5e_2_as_text_and_a_map_as_a_number():
 
 
 def test_a_run_says_which_map_is_broken(run):
-    with pytest.raises(EvaluationError, match=r"map\.pgm"):
+    with pytest.raises(InputError, match=r"map\.pgm"):
         _ = run.maps
 
 
@@ -329,5 +329,5 @@ def test_what_occurs_twice_is_refused(tmp_path, run, name, line):
     path = tmp_path / "run" / name
     text = path.read_text()
     path.write_text(text + line if line else text.replace('"error"', '"uplink"'))
-    with pytest.raises(EvaluationError, match="occurs twice"):
+    with pytest.raises(InputError, match="occurs twice"):
         open_run(tmp_path / "run")

@@ -18,7 +18,7 @@ from backports import zstd
 
 from fcslam import untrusted
 from fcslam.config import load
-from fcslam.errors import ConfigError, EvaluationError, SourceError
+from fcslam.errors import InputError, SourceError
 from fcslam.mission.mission import MissionConfig
 from fcslam.runs import open_run
 from fcslam.sources import open_source
@@ -214,7 +214,7 @@ def test_a_run_folder_reads_no_file_but_its_own(run, tmp_path, name, kind):
         os.mkfifo(run / name)
     else:
         (run / name).symlink_to(tmp_path / "private" if kind == "link" else "/dev/zero")
-    with pytest.raises(EvaluationError) as caught:
+    with pytest.raises(InputError) as caught:
         open_run(run)
     assert SECRET not in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -231,13 +231,13 @@ def test_a_run_folder_reads_no_file_but_its_own(run, tmp_path, name, kind):
 )
 def test_a_description_of_a_map_that_cannot_be_is_refused(run, old, new, reason):
     (run / "map.yaml").write_text((run / "map.yaml").read_text().replace(old, new))
-    with pytest.raises(EvaluationError, match=reason):
+    with pytest.raises(InputError, match=reason):
         _ = open_run(run).maps
 
 
 def test_settings_that_expand_are_refused(tmp_path):
     (tmp_path / "config.yaml").write_text(MERGES)
-    with pytest.raises(ConfigError, match="aliases"):
+    with pytest.raises(InputError, match="aliases"):
         load(MissionConfig, tmp_path / "config.yaml")
 
 

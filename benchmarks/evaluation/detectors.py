@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.features.classical import Orb, OrbConfig
 from fcslam.features.detector import (
     BUNDLED_NETWORK,
@@ -138,7 +138,7 @@ def choose_detectors(names: Sequence[EvaluatedDetectorKind], weights: Sequence[P
 
     Raises:
         FeatureError: a network's weights cannot be used.
-        EvaluationError: two detectors have one name.
+        InputError: two detectors have one name.
     """
     if not names:
         has_network = bool(weights) or BUNDLED_NETWORK.is_file()
@@ -148,7 +148,7 @@ def choose_detectors(names: Sequence[EvaluatedDetectorKind], weights: Sequence[P
         detectors += [_network(name, path) for path in networks] if name in _NETWORKS else [_classical(name)]
     doubled = {each.name for each in detectors if [other.name for other in detectors].count(each.name) > 1}
     if doubled:
-        raise EvaluationError(f"{min(doubled)}: named twice; give each detector and network once")
+        raise InputError(f"{min(doubled)}: named twice; give each detector and network once")
     return tuple(detectors)
 
 
@@ -224,16 +224,16 @@ def find_scenes(folders: Sequence[Path]) -> list[Scene]:
     """Find scenes, sorted by name. Each folder is a scene, or contains scenes.
 
     Raises:
-        EvaluationError: a folder is or holds none, two scenes have one name, or a scene's files do not fit together.
+        InputError: a folder is or holds none, two scenes have one name, or a scene's files do not fit together.
     """
     scenes: dict[str, Scene] = {}
     for folder in folders:
         found = [place for place in (folder, *sorted(folder.glob("*/"))) if any(place.glob("H_1_*"))]
         if not found:
-            raise EvaluationError(f"{folder}: no scene in it; a scene is a folder with images 1, 2 ... and H_1_2 ...")
+            raise InputError(f"{folder}: no scene in it; a scene is a folder with images 1, 2 ... and H_1_2 ...")
         for place in found:
             if place.name in scenes:
-                raise EvaluationError(f"{place}: there is another scene {place.name}; rename one")
+                raise InputError(f"{place}: there is another scene {place.name}; rename one")
             scenes[place.name] = _read_scene(place)
     return [scenes[name] for name in sorted(scenes)]
 
@@ -245,7 +245,7 @@ def _read_scene(folder: Path) -> Scene:
     wrong = [path.name for path, number in zip(files, numbers, strict=True) if not number.isdecimal()]
     missing = [number for number in ("1", *numbers) if number.isdecimal() and int(number) not in images]
     if wrong or missing:
-        raise EvaluationError(f"{folder}: {f'what is {wrong[0]}?' if wrong else f'image {missing[0]} is missing'}")
+        raise InputError(f"{folder}: {f'what is {wrong[0]}?' if wrong else f'image {missing[0]} is missing'}")
     pairs = sorted((int(number), path) for number, path in zip(numbers, files, strict=True))
     return Scene(folder, images[1], tuple((images[number], _read_homography(path)) for number, path in pairs))
 
@@ -254,7 +254,7 @@ def _read_homography(path: Path) -> FloatArray:
     try:
         H = np.array([float(word) for word in read_text(path).split()])
     except (OSError, ValueError) as error:
-        raise EvaluationError(f"{path}: cannot read the homography ({error}); give 3 x 3 numbers") from error
+        raise InputError(f"{path}: cannot read the homography ({error}); give 3 x 3 numbers") from error
     if H.shape != (9,) or not np.isfinite(H).all() or H[8] == 0.0 or abs(np.linalg.det(H.reshape(3, 3))) < 1e-12:
-        raise EvaluationError(f"{path}: no homography; give 3 x 3 finite numbers that can be inverted")
+        raise InputError(f"{path}: no homography; give 3 x 3 finite numbers that can be inverted")
     return frozen(H.reshape(3, 3) / H[8])

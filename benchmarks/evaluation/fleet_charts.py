@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.lab.evaluation.ground_truth import TRUE_MAP, KnownPoses, known_poses, read_grid, truth_folder
 from fcslam.metrics.trajectory import align
 from fcslam.records import ClosureStatus, FloatArray
@@ -20,12 +20,12 @@ def fleet_charts(run: Path, truth: Path | None = None) -> FleetCharts:
     Without ``truth`` it searches for the truth like ``evaluate_fleet``.
 
     Raises:
-        EvaluationError: the run has no maps of single robots, or the truth of a robot or the true map is missing.
+        InputError: the run has no maps of single robots, or the truth of a robot or the true map is missing.
     """
     opened, folder = open_run(run), truth_folder(run, truth)
     known = known_poses(opened, folder)
     if not opened.local_maps:
-        raise EvaluationError(f"{run}: has no {LOCAL}/ with the robots' own maps; map the recordings again")
+        raise InputError(f"{run}: has no {LOCAL}/ with the robots' own maps; map the recordings again")
     return FleetCharts(
         local={
             robot: Chart(read_grid(run / LOCAL / f"{robot}.yaml"), {robot: local.T_local_base})

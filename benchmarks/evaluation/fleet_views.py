@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.closures import STAGES, ClosureScope, closure_rows, closure_sets
 from fcslam.lab.evaluation.ground_truth import GAP_S, KnownPoses, known_poses
@@ -55,16 +55,16 @@ def read_fleet_views(folder: Path) -> FleetViews:
     """Read the images of a recorded fleet that are places, and write them to ``IMAGES`` in its folder.
 
     Raises:
-        EvaluationError: there are fewer than two recordings with a camera and true poses, or their sensors differ.
+        InputError: there are fewer than two recordings with a camera and true poses, or their sensors differ.
         SourceError: a recording cannot be read.
     """
     robots = sorted(path.parent for path in folder.glob(f"*/{GROUND_TRUTH}"))
     views = [list(_views(robot)) for robot in robots]
     sensors = {(view.scan.laser, view.image.camera) for own in views for view in own}
     if len(robots) < 2 or len(sensors) > 1:
-        raise EvaluationError(f"{folder}: {len(robots)} recordings; a fleet is two or more robots with like sensors")
+        raise InputError(f"{folder}: {len(robots)} recordings; a fleet is two or more robots with like sensors")
     if not all(views):
-        raise EvaluationError(f"{folder}: a robot has no image whose pose is known; simulate it with a camera")
+        raise InputError(f"{folder}: a robot has no image whose pose is known; simulate it with a camera")
     ((laser, camera),) = sensors
     everything = [view for own in views for view in own]
     T_building_laser = se2.compose(np.array([view.T_building_base for view in everything]), laser.T_base_laser)

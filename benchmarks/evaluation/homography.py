@@ -139,7 +139,7 @@ def evaluate_homography(
 
     Raises:
         FeatureError: an image, or extracted features, cannot be read.
-        EvaluationError: extracted features belong to another image.
+        InputError: extracted features belong to another image.
     """
     stopwatch, pairs = Stopwatch(), list[PairResult]()
     with one_thread():
@@ -268,7 +268,7 @@ def write_pairs(report: HomographyReport, path: Path) -> None:
     """Write a CSV file with a line for every detector and pair, and a column for every measure.
 
     Raises:
-        OutputError: the file cannot be written.
+        InputError: the file cannot be written.
     """
     rows = [(pair, pair_measures(pair)) for pair in report.pairs]
     names = list(dict.fromkeys(name for _, measures in rows for name in measures))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.compiled import njit
-from fcslam.errors import EvaluationError, FeatureError
+from fcslam.errors import FeatureError, InputError
 from fcslam.features.classical import Orb, OrbConfig
 from fcslam.features.codes import code_words, hamming_matrix, mutual_matches
 from fcslam.features.detector import FeatureDetector, ImageFeatures, OnnxConfig, OnnxDetector
@@ -303,7 +303,7 @@ def describe_sets(
     """Describe sets of images with ``features``, and recordings with the places of the robot's front end.
 
     Raises:
-        EvaluationError: a set cannot be read, or two have one name.
+        InputError: a set cannot be read, or two have one name.
         FeatureError: an image or its features cannot be read.
         SourceError: a recording cannot be read.
     """
@@ -315,7 +315,7 @@ def describe_sets(
         else:
             each = describe_images(read_place_set(path, labels), path, features, watch)
         if each.place_set.name in described:
-            raise EvaluationError(f"{path}: there is another set {each.place_set.name}; rename one")
+            raise InputError(f"{path}: there is another set {each.place_set.name}; rename one")
         described[each.place_set.name] = each
     return list(described.values())
 
@@ -374,7 +374,7 @@ def describe_recording(recording: Path) -> DescribedSet:
 
     Raises:
         SourceError: the recording cannot be read.
-        EvaluationError: the recording has fewer than two places.
+        InputError: the recording has fewer than two places.
     """
     source = open_source(recording)
     config = RobotConfig(channels=(Channel.LIDAR,), lost=LostConfig(doubted=0.0))  # one session, whatever happens
@@ -385,7 +385,7 @@ def describe_recording(recording: Path) -> DescribedSet:
     packets += robot.finish()
     places = [packet.body for packet in packets if isinstance(packet.body, Place)]
     if len(places) < 2:
-        raise EvaluationError(f"{recording}: nothing to compare, {len(places)} place in it; give a longer recording")
+        raise InputError(f"{recording}: nothing to compare, {len(places)} place in it; give a longer recording")
     stamps = {packet.body.id: packet.body.stamp for packet in packets if isinstance(packet.body, Keyscan)}
     poses = _corrected(packets)[[place.id.number for place in places]]
 

@@ -28,7 +28,7 @@ from typing import Final
 
 import numpy as np
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.untrusted import read_text
 
 from .fleet_views import read_fleet_views
@@ -69,7 +69,7 @@ def read_place_set(folder: Path, labels: Collection[str] = ()) -> PlaceSet:
     """Read the set in a folder; ``labels`` selects images of a set with labels.
 
     Raises:
-        EvaluationError: the folder has no known set, its files are inconsistent, or no image has these labels.
+        InputError: the folder has no known set, its files are inconsistent, or no image has these labels.
         SourceError: a robot's recording cannot be read.
     """
     readers: dict[str, Callable[[], PlaceSet]] = {
@@ -81,15 +81,15 @@ def read_place_set(folder: Path, labels: Collection[str] = ()) -> PlaceSet:
     }
     kind = next((name for name in readers if (folder / name).is_file()), None)
     if kind is None:
-        raise EvaluationError(f"{folder}: no set of places; it needs one of {', '.join(readers)}")
+        raise InputError(f"{folder}: no set of places; it needs one of {', '.join(readers)}")
     if labels and kind != LABELLED:
-        raise EvaluationError(f"{folder}: its images have no labels; leave --label out")
+        raise InputError(f"{folder}: its images have no labels; leave --label out")
     try:
         found = readers[kind]()
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise EvaluationError(f"{folder / kind}: cannot be read as a set of places ({error!r})") from error
+        raise InputError(f"{folder / kind}: cannot be read as a set of places ({error!r})") from error
     if not (found.queries and found.gallery):
-        raise EvaluationError(f"{folder}: no queries or no gallery; is the folder complete, are the labels right?")
+        raise InputError(f"{folder}: no queries or no gallery; is the folder complete, are the labels right?")
     return found
 
 
@@ -110,7 +110,7 @@ def _read_tower(folder: Path, labels: Collection[str]) -> PlaceSet:
     frames = [_FRAME.fullmatch(str(Path(row["image"]).with_suffix(""))) for row in rows]
     wrong = [row["image"] for row, frame in zip(rows, frames, strict=True) if frame is None]
     if wrong:
-        raise EvaluationError(f"{folder}: {wrong[0]} is not a <clip>_frame_<number>")
+        raise InputError(f"{folder}: {wrong[0]} is not a <clip>_frame_<number>")
     clips = np.array([frame[1] for frame in frames if frame])
     numbers = np.array([int(frame[2]) for frame in frames if frame])
     floors, areas = (np.array([row[key] for row in rows]) for key in ("label", "area"))
@@ -137,7 +137,7 @@ def _read_tour(folder: Path) -> PlaceSet:
     pairs = np.loadtxt(io.StringIO(read_text(folder / "loop_pairs.txt")), dtype=np.int64, usecols=(0, 1), ndmin=2)
     missing = sorted(set(pairs.ravel()) - set(numbers))
     if missing:
-        raise EvaluationError(f"{folder}: loop_pairs.txt names image {missing[0]}, which is not there")
+        raise InputError(f"{folder}: loop_pairs.txt names image {missing[0]}, which is not there")
     earlier, later = np.searchsorted(numbers, np.sort(pairs, axis=1)).T
     count = len(numbers)
     matches, near = np.zeros((count, count), np.bool_), np.zeros((count, count), np.bool_)
@@ -180,9 +180,9 @@ def _read_generic(folder: Path) -> PlaceSet:
         for line in csv.DictReader(file):
             relation = line["relation"]
             if relation not in ("match", "ignored"):
-                raise EvaluationError(f"{folder}: relation '{relation}' in matches.csv; give match or ignored")
+                raise InputError(f"{folder}: relation '{relation}' in matches.csv; give match or ignored")
             if line["query"] not in rows or line["gallery"] not in columns:
-                raise EvaluationError(f"{folder}: matches.csv names {line['query']}, {line['gallery']}: not both there")
+                raise InputError(f"{folder}: matches.csv names {line['query']}, {line['gallery']}: not both there")
             (matches if relation == "match" else ignored)[rows[line["query"]], columns[line["gallery"]]] = True
     truth = PairTruth(matches & ~ignored, ~matches & ~ignored)
     return PlaceSet(folder.resolve().name, queries, gallery, np.ones_like(matches), {"matches": truth})

@@ -195,7 +195,7 @@ def save(figure: Any, path: Path) -> None:
     """Write a figure as PNG.
 
     Raises:
-        OutputError: the file cannot be written.
+        InputError: the file cannot be written.
     """
     with writing(path, "choose another place"):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import shortest_path
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.graph.initialization import initialize_robust
 from fcslam.graph.optimizer import optimize_gnc
@@ -229,14 +229,14 @@ def evaluate_closures(run: Path, relations: Path) -> ClosureReport:
     """Precision and recall of the closures in the run folder ``run`` against the file ``relations``.
 
     Raises:
-        EvaluationError: one of them cannot be read, or no relation names a stamp of the run.
+        InputError: one of them cannot be read, or no relation names a stamp of the run.
     """
     graph = build_relation_graph(read_relations(relations))
     opened = open_run(run)
     poses = pose_table(opened)
     node_rows = poses.find(graph.stamps)
     if not np.any(node_rows >= 0):
-        raise EvaluationError(f"{relations}: no relation names a stamp of {run}; are they of the same recording?")
+        raise InputError(f"{relations}: no relation names a stamp of {run}; are they of the same recording?")
     evidence = _gather(opened, poses, graph, node_rows)
     scores = {
         (within, status): evidence.score(members, within, status in STAGES)

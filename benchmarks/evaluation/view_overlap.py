@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from fcslam.compiled import njit
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.features.files import read_grey
 from fcslam.records import FloatArray
 from fcslam.untrusted import read_bytes, read_text
@@ -146,16 +146,16 @@ def read_sequence(folder: Path) -> Sequence:
     begins with the camera's, perhaps after ``rgbd_dataset_``. Depth may be smaller by a whole factor.
 
     Raises:
-        EvaluationError: a file is missing or does not fit.
+        InputError: a file is missing or does not fit.
         OSError, ValueError: a file cannot be read.
     """
     lines = [line.split() for line in _lines(folder / "associations.txt")]
     poses = np.array([[float(word) for word in line.split()] for line in _lines(folder / "groundtruth.txt")])
     if poses.ndim != 2 or poses.shape[1] != 8 or len(poses) < 2 or (np.diff(poses[:, 0]) <= 0.0).any():
-        raise EvaluationError(f"{folder / 'groundtruth.txt'}: needs lines of stamp x y z qx qy qz qw, in order of time")
+        raise InputError(f"{folder / 'groundtruth.txt'}: needs lines of stamp x y z qx qy qz qw, in order of time")
     lines = [line for line in lines if _is_covered(float(line[0]), poses[:, 0])]
     if not lines:
-        raise EvaluationError(f"{folder}: no image at a time when its pose is known")
+        raise InputError(f"{folder}: no image at a time when its pose is known")
     images = tuple(folder / line[1] for line in lines)
     depths_m = np.stack([_read_depth(folder / line[3]) for line in lines])
     stamps = np.array([float(line[0]) for line in lines])
@@ -169,7 +169,7 @@ def _lines(path: Path) -> list[str]:
     try:
         text = read_text(path)
     except OSError as error:
-        raise EvaluationError(f"{path}: cannot be read ({error}); a sequence needs it") from error
+        raise InputError(f"{path}: cannot be read ({error}); a sequence needs it") from error
     return [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
 
 
@@ -191,7 +191,7 @@ def _poses_at(stamps: FloatArray, poses: FloatArray) -> FloatArray:
 def _read_depth(path: Path) -> FloatArray:
     depth = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
     if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
-        raise EvaluationError(f"{path}: no depth image of 16 bits")
+        raise InputError(f"{path}: no depth image of 16 bits")
     return np.asarray(depth, np.float64) / DEPTH_UNITS_PER_M
 
 
@@ -209,4 +209,4 @@ def _calibration(folder: Path) -> FloatArray:
         camera, *numbers = line.split()
         if name.startswith(camera) and len(numbers) == 9:
             return np.array([float(number) for number in numbers])
-    raise EvaluationError(f"{path}: has no camera whose name {name} begins with")
+    raise InputError(f"{path}: has no camera whose name {name} begins with")

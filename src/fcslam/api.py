@@ -254,7 +254,7 @@ def settings_of(config: MissionConfig | Mapping[str, Any] | StrPath | None) -> M
     """A complete configuration from what a user gives.
 
     Raises:
-        ConfigError: a key is unknown, a value is wrong, or the file cannot be read.
+        InputError: a key is unknown, a value is wrong, or the file cannot be read.
     """
     if isinstance(config, str | os.PathLike):
         return load(MissionConfig, Path(config))

@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from fcslam.errors import ConfigError, printable
+from fcslam.errors import InputError, printable
 from fcslam.untrusted import MOST_TEXT_BYTES, read_text
 
 LONGEST_QUOTE: Final = 300
@@ -47,13 +47,13 @@ def load(kind: type[SettingsType], path: Path, over: SettingsType | None = None)
     try:
         content = parse_yaml(read_text(path, most=MOST_TEXT_BYTES))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
+        raise InputError(f"{path}: cannot read the configuration ({error}); give a YAML file") from error
     except ValueError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise InputError(f"{path}: {error}") from error
     if content is None:
         content = {}
     if not isinstance(content, dict):
-        raise ConfigError(f"{path}: expected a mapping of keys; `fcslam tools config` prints a complete one")
+        raise InputError(f"{path}: expected a mapping of keys; `fcslam tools config` prints a complete one")
     return parse(kind, content, str(path)) if over is None else changed(over, content, str(path))
 
 
@@ -66,7 +66,7 @@ def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> Sett
     """Check ``content`` against ``kind``; ``where`` names its origin in messages.
 
     Raises:
-        ConfigError: a key is unknown (the message names the most similar key), or a value is wrong.
+        InputError: a key is unknown (the message names the most similar key), or a value is wrong.
     """
     try:
         return kind.model_validate(content)
@@ -74,16 +74,16 @@ def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> Sett
         raise _refusal(kind, error, where) from error
 
 
-def _refusal(kind: type[Settings], error: ValidationError, where: str) -> ConfigError:
+def _refusal(kind: type[Settings], error: ValidationError, where: str) -> InputError:
     """One line about the first fault that pydantic found in ``kind``."""
     first = error.errors()[0]
     key = one_line(".".join(str(part) for part in first["loc"]))
     if first["type"] == "extra_forbidden":
-        return ConfigError(f"{where}: unknown key '{key}'{_nearest(kind, first['loc'])}")
+        return InputError(f"{where}: unknown key '{key}'{_nearest(kind, first['loc'])}")
     if first["type"] == "value_error" and isinstance(first["input"], dict):  # keys that do not fit each other
         place = f"{where}: {key}" if key else where
-        return ConfigError(f"{place}: {first['ctx']['error']}")
-    return ConfigError(f"{where}: {key}: {one_line(first['msg'])} (given: {one_line(repr(first['input']))})")
+        return InputError(f"{place}: {first['ctx']['error']}")
+    return InputError(f"{where}: {key}: {one_line(first['msg'])} (given: {one_line(repr(first['input']))})")
 
 
 def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

@@ -30,12 +30,12 @@ def writing(path: Path, advice: str = "free disk space and run the same command 
     """Report an error of the operating system in this block as one of writing ``path``; ``advice``: what to do then.
 
     Raises:
-        OutputError: the block cannot write.
+        InputError: the block cannot write.
     """
     try:
         yield
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error}); {advice}") from error
+        raise InputError(f"{path}: cannot be written ({error}); {advice}") from error
 
 
 def printable(text: str) -> str:
@@ -62,40 +62,8 @@ class SourceError(InputError):
     """A recording cannot be read."""
 
 
-class ConfigError(InputError):
-    """A settings file, one of its keys or a veto is wrong."""
-
-
-class OutputError(InputError):
-    """The output folder cannot be used."""
-
-
-class SimulationError(InputError):
-    """A fleet cannot be simulated: the building is too small, or a library is missing."""
-
-
 class FeatureError(InputError):
     """Network weights, images or extracted features cannot be used."""
-
-
-class TrainingError(InputError):
-    """A detector cannot be trained: images, teacher points or a checkpoint are unusable, or torch is missing."""
-
-
-class EvaluationError(InputError):
-    """A reference file or a run folder cannot be evaluated."""
-
-
-class EditError(InputError):
-    """An edit of a mission cannot be undone, or cannot be read; the message says why."""
-
-
-class StateError(InputError):
-    """A robot's state folder belongs to another robot or recording, is in use, or is damaged."""
-
-
-class NetworkError(InputError):
-    """A ROS network cannot be used: its middleware, its topics or its transforms are missing."""
 
 
 class CloudError(InputError):
@@ -113,10 +81,6 @@ class UnavailableError(FcslamError):
         super().__init__(message)
         self.retry_after_s = retry_after_s
         """Time to wait before the next attempt, as the cloud asks; 0 if it does not."""
-
-
-class ServiceError(InputError):
-    """The service cannot run: tokens, certificates, address, folder or mission are unusable."""
 
 
 class StoreError(InputError):

@@ -15,7 +15,7 @@ from evaluation.homography import (
     mean,
 )
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.features.detector import ImageFeatures
 from fcslam.learning.homography import warp
 from tests.features.networks import tiny_network
@@ -107,7 +107,7 @@ def test_without_names_there_is_all_but_two_of_one_network(tmp_path):
     tiny_network(path)
     names = [each.name for each in choose_detectors([], [path])]
     assert names == ["tiny-1", "tiny-1-logits", "orb", "sift", "fast", "harris", "shi"]
-    with pytest.raises(EvaluationError, match="tiny-1: named twice"):
+    with pytest.raises(InputError, match="tiny-1: named twice"):
         choose_detectors([EvaluatedDetectorKind.ONNX], [path, path])
 
 

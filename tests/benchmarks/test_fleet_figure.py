@@ -12,7 +12,7 @@ from evaluation.fleet_figure import (
     write_figure,
 )
 
-from fcslam.errors import OutputError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.maps import palette
 from fcslam.metrics.grid import LabelledGrid
@@ -99,7 +99,7 @@ def test_the_same_charts_make_the_same_file(charts, tmp_path):
     for name in ("one.png", "two.png"):
         write_figure(charts, tmp_path / name)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(InputError, match="cannot be written"):
         write_figure(charts, tmp_path / "missing" / "figure.png")
 
 

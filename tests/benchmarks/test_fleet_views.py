@@ -6,7 +6,7 @@ import pytest
 from evaluation.fleet_views import MatchViews, judge_views, lidar_overlap, read_fleet_views
 from evaluation.place_sets import read_place_set
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.records import (
     CameraImage,
@@ -157,10 +157,10 @@ def test_matches_are_judged_by_what_both_cameras_see(fleet):
 def test_what_is_no_fleet_with_cameras_is_refused(fleet, tmp_path_factory):
     folder = tmp_path_factory.mktemp("blind")
     (folder / "simulation.yaml").write_text("seed: 1\n", encoding="utf-8")
-    with pytest.raises(EvaluationError, match="0 recordings; a fleet is two"):
+    with pytest.raises(InputError, match="0 recordings; a fleet is two"):
         read_place_set(folder)
     poses = np.full((3, 3), 1.0)
     record(folder / "a", poses, None)
     record(folder / "b", poses, None)
-    with pytest.raises(EvaluationError, match="has no image whose pose is known"):
+    with pytest.raises(InputError, match="has no image whose pose is known"):
         read_place_set(folder)

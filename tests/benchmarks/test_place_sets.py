@@ -8,7 +8,7 @@ import pytest
 from evaluation.place_sets import read_place_set
 from evaluation.view_overlap import DepthCamera, view_overlap
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from tests.benchmarks import place_folders
 
 
@@ -33,7 +33,7 @@ def test_floors_of_a_tower(tmp_path):
 def test_some_floors_only(tmp_path):
     found = read_place_set(place_folders.tower(tmp_path / "tower"), ["floor2"])
     assert {path.parent.name for path in (*found.queries, *found.gallery)} == {"floor2"}
-    with pytest.raises(EvaluationError, match="no queries"):
+    with pytest.raises(InputError, match="no queries"):
         read_place_set(tmp_path / "tower", ["floor9"])
 
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from fcslam.cli import live, main
 from fcslam.cli.play import robot_watch
 from fcslam.cli.progress import ProgressDisplay
-from fcslam.errors import CloudError, StateError
+from fcslam.errors import CloudError, InputError
 from fcslam.live.records import RobotStatus, Wiring
 from fcslam.live.robot import Robot
 from fcslam.robot.outbox import WaitingPackets
@@ -241,7 +241,7 @@ def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives(monkeypat
     assert told == [("plan", "anna"), "keyframes are placed", True, False, "closed"]
 
 
-@pytest.mark.parametrize("failure", [CloudError("the token is not known (401)"), StateError("the disk is full")])
+@pytest.mark.parametrize("failure", [CloudError("the token is not known (401)"), InputError("the disk is full")])
 def test_a_live_robot_that_is_turned_away_does_not_lose_its_run(monkeypatch, tmp_path, capsys, failure):
     """Whatever the server or the outbox says, the drive is written; the error comes after it."""
     scans = list(small_fleet.draw(1, path_length_m=6.0).robots[0].scans())

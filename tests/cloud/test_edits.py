@@ -10,7 +10,7 @@ from fcslam.cloud.edits import check_undo, edit_json, in_force, is_removed, kind
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
-from fcslam.errors import EditError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.records import (
     Cut,
@@ -75,7 +75,7 @@ def test_an_edit_survives_as_text(content):
     ],
 )  # fmt: skip
 def test_what_is_no_edit_is_refused(kind, content):
-    with pytest.raises(EditError):
+    with pytest.raises(InputError):
         read_edit(kind, content)
 
 
@@ -84,7 +84,7 @@ def test_in_force_is_what_nothing_undid():
     assert in_force(edits) == (Removal("b"),)
     check_undo(edits, 4)
     for number in (0, 1, 2, 3, 6):
-        with pytest.raises(EditError):
+        with pytest.raises(InputError):
             check_undo(edits, number)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fcslam.config import one_line, parse_yaml
-from fcslam.errors import ConfigError, SourceError
+from fcslam.errors import InputError, SourceError
 from fcslam.mission.localization import read_map
 from tests.fuzz.mutations import mutate
 from tests.fuzz.targets import TARGETS, attempt
@@ -73,7 +73,7 @@ def test_the_same_seed_and_number_break_an_input_in_the_same_way(fuzz):
 
 def test_a_long_reason_is_a_finding():
     def refuse():
-        raise ConfigError("x" * 5000)
+        raise InputError("x" * 5000)
 
     with pytest.raises(AssertionError, match="5000 characters"):
         attempt(refuse)

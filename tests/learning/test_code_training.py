@@ -7,7 +7,7 @@ from tests.learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
-from fcslam.errors import TrainingError  # noqa: E402
+from fcslam.errors import InputError  # noqa: E402
 from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
 from fcslam.learning.code_batches import RevisitExamples, RevisitPair  # noqa: E402
 from fcslam.learning.code_training import CodeInputs, train_codes  # noqa: E402
@@ -128,5 +128,5 @@ def test_inputs_are_computed_again_only_if_the_layers_before_changed(light):
 
 
 def test_a_robot_that_saw_nothing_again_is_told_so(light):
-    with pytest.raises(TrainingError, match="no place was"):
+    with pytest.raises(InputError, match="no place was"):
         trained(light, LocalTrainingPlan(SMALL, 0, 1), revisits=RevisitExamples(OWN.images))

@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 pytest.importorskip("onnx", reason="needs fcslam[train]")
 runtime = pytest.importorskip("onnxruntime", reason="needs fcslam[train]")
 
-from fcslam.errors import OutputError  # noqa: E402
+from fcslam.errors import InputError  # noqa: E402
 from fcslam.learning.export import detector_version, export_onnx  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 
@@ -53,5 +53,5 @@ def test_other_weights_have_another_version():
 @pytest.mark.slow
 def test_a_place_that_cannot_be_written_is_said(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(InputError, match="cannot be written"):
         export_onnx(network("light"), tmp_path / "file" / "detector.onnx")

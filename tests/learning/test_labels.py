@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.homographic_adaptation import adapt, harris, peaks
 from fcslam.learning.labels import Labels, fuse_keypoints, read_labels, read_teacher, write_labels
 from fcslam.learning.synthetic_shapes import FAMILIES, background, ellipses, noise
@@ -77,13 +77,13 @@ def test_labels_are_kept_for_the_image_they_belong_to(tmp_path):
 @pytest.mark.parametrize("content", [b"", b"nonsense", b"PK\x03\x04 no archive"])
 def test_a_broken_teacher_is_said(tmp_path, content):
     (tmp_path / "x.npz").write_bytes(content)
-    with pytest.raises(TrainingError, match=r"x\.npz"):
+    with pytest.raises(InputError, match=r"x\.npz"):
         read_teacher(tmp_path / "x.npz")
 
 
 def test_a_teacher_whose_parts_do_not_fit_is_said(tmp_path):
     np.savez(tmp_path / "x.npz", keypoints=np.zeros((3, 2)), scores=np.zeros(3), descriptors=np.full((3, 8), np.nan))
-    with pytest.raises(TrainingError, match="do not fit"):
+    with pytest.raises(InputError, match="do not fit"):
         read_teacher(tmp_path / "x.npz")
 
 
@@ -92,7 +92,7 @@ def test_a_teacher_whose_parts_do_not_fit_is_said(tmp_path):
 )
 def test_scores_that_rank_nothing_are_refused(tmp_path, scores):
     np.savez(tmp_path / "x.npz", keypoints=np.zeros((3, 2)), scores=scores, descriptors=np.zeros((3, 8)))
-    with pytest.raises(TrainingError, match=r"x\.npz.*do not fit"):
+    with pytest.raises(InputError, match=r"x\.npz.*do not fit"):
         read_teacher(tmp_path / "x.npz")
 
 

@@ -6,7 +6,7 @@ from tests.learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
-from fcslam.errors import TrainingError  # noqa: E402
+from fcslam.errors import InputError  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
 from fcslam.learning.labels import fuse_keypoints  # noqa: E402
 from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, local_training  # noqa: E402
@@ -75,11 +75,11 @@ def test_moments_that_are_no_numbers_are_given_to_no_other_leg(examples, start, 
         optimizer.step()
 
     monkeypatch.setattr("fcslam.learning.local_training.descend", overflow)
-    with pytest.raises(TrainingError, match="diverged in the last step"):
+    with pytest.raises(InputError, match="diverged in the last step"):
         local_training(start, examples, LocalTrainingPlan(SMALL, 0, 1))
 
 
 def test_weights_that_make_training_diverge_are_said(examples, start):
     broken = start | {"body.code_head.1.bias": torch.full_like(start["body.code_head.1.bias"], torch.nan)}
-    with pytest.raises(TrainingError, match="diverged at step 7"):
+    with pytest.raises(InputError, match="diverged at step 7"):
         local_training(broken, examples, LocalTrainingPlan(SMALL, 7, 1))

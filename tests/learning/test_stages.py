@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.images import LARGEST_SIDE_PX, find_images, is_held_out, is_usable, read_image
 from tests.learning.textures import textured
 
@@ -65,7 +65,7 @@ def test_files_of_two_teachers_are_refused(tmp_path):
     for seed, size in ((1, 8), (2, 8), (3, 16)):
         write(tmp_path / "x" / f"{seed}.png", textured(seed))
         teach(tmp_path / "teacher" / "x", f"{seed}.png", size)
-    with pytest.raises(TrainingError, match=r"3\.png\.npz: has descriptors of another size .*8 and 16"):
+    with pytest.raises(InputError, match=r"3\.png\.npz: has descriptors of another size .*8 and 16"):
         labelled_with_teacher(tmp_path)
 
 
@@ -102,7 +102,7 @@ def test_other_settings_of_labels_give_other_labels(tmp_path):
 def test_folders_of_one_name_with_the_same_files_are_refused(tmp_path):
     for place in ("here", "there"):
         write(tmp_path / place / "photos" / "1.png", textured(1))
-    with pytest.raises(TrainingError, match="same name"):
+    with pytest.raises(InputError, match="same name"):
         find_images([tmp_path / "here" / "photos", tmp_path / "there" / "photos"])
 
 

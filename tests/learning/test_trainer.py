@@ -10,7 +10,7 @@ from tests.learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
-from fcslam.errors import OutputError, TrainingError  # noqa: E402
+from fcslam.errors import InputError  # noqa: E402
 from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
 from fcslam.learning.labels import Teacher, fuse_keypoints  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
@@ -103,7 +103,7 @@ def test_a_full_disk_leaves_the_last_good_checkpoint(examples, tmp_path, monkeyp
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("fcslam.learning.arrays.write_file", full)
-    with pytest.raises(OutputError, match="No space left on device"):
+    with pytest.raises(InputError, match="No space left on device"):
         TrainingRun(SMALL.model_copy(update={"steps": 8}), "joint", tmp_path, PACE).train(examples, examples[:1])
     assert (tmp_path / CHECKPOINT_FILE).read_bytes() == before
     assert [file.name for file in tmp_path.iterdir() if file.suffix == ".partial"] == []
@@ -112,14 +112,14 @@ def test_a_full_disk_leaves_the_last_good_checkpoint(examples, tmp_path, monkeyp
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", b"PK\x03\x04"])
 def test_a_foreign_checkpoint_is_said(examples, tmp_path, content):
     (tmp_path / CHECKPOINT_FILE).write_bytes(content)
-    with pytest.raises(TrainingError, match=r"checkpoint\.npz: is not a checkpoint"):
+    with pytest.raises(InputError, match=r"checkpoint\.npz: is not a checkpoint"):
         TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
 
 
 @pytest.mark.slow
 def test_a_checkpoint_of_other_settings_is_refused_but_more_steps_are_not(examples, tmp_path):
     TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
-    with pytest.raises(TrainingError, match="other settings"):
+    with pytest.raises(InputError, match="other settings"):
         TrainingRun(SMALL.model_copy(update={"seed": 5}), "joint", tmp_path, PACE).train(examples, examples[:1])
     more = TrainingRun(SMALL.model_copy(update={"steps": 7}), "joint", tmp_path, PACE)
     more.train(examples, examples[:1])

@@ -9,7 +9,7 @@ import yaml
 from pydantic import ValidationError
 
 from fcslam.config import parse
-from fcslam.errors import ConfigError
+from fcslam.errors import InputError
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.lidar.own_body import body_sectors, is_in_sectors
 from fcslam.records import LaserModel, frozen
@@ -110,7 +110,7 @@ def test_the_footprint_is_written_as_in_nav2():
      [[0.0, 0.0], [1.0, 0.0], [0.0, math.nan]], [[0.0, 0.0], [99.0, 0.0], [0.0, 1.0]], 0.3],
 )  # fmt: skip
 def test_a_footprint_that_is_no_polygon_is_one_line(corners):
-    with pytest.raises(ConfigError, match=r"^my\.yaml: footprint.*: [^\n]+ \(given: [^\n]+\)$"):
+    with pytest.raises(InputError, match=r"^my\.yaml: footprint.*: [^\n]+ \(given: [^\n]+\)$"):
         parse(LidarConfig, {"footprint": corners}, "my.yaml")
 
 

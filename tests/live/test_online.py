@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.errors import CloudError, InputError, StateError
+from fcslam.errors import CloudError, InputError
 from fcslam.features.detector_file import describe_detector_file
 from fcslam.geometry import se2
 from fcslam.live.playback import PlaybackPace, play
@@ -148,7 +148,7 @@ def test_a_robot_that_starts_anew_has_a_new_epoch_and_the_old_one_is_not_lost(sc
 def test_another_recording_cannot_be_resumed(scans, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         drive(tmp_path, Network(FakeCloud()), stop_after(scans, 20))
-    with pytest.raises(StateError, match="differs from that of the interrupted run"):
+    with pytest.raises(InputError, match="differs from that of the interrupted run"):
         drive(tmp_path, Network(FakeCloud()), scans[1:], resume=True)
 
 
@@ -191,7 +191,7 @@ def test_a_refused_packet_that_cannot_be_kept_waits(scans, alone, tmp_path):
     place = next(packet for packet in alone if isinstance(packet.body, Place))
     cloud = FakeCloud(unwanted={content(encode(place))})
     (tmp_path / "refused").touch()
-    with pytest.raises(StateError, match="refused: cannot store a refused packet"):
+    with pytest.raises(InputError, match="refused: cannot store a refused packet"):
         drive(tmp_path, Network(cloud), scans)
     outbox = Outbox(tmp_path / "outbox.sqlite", "alice", 10**9)
     assert content(outbox.packet(*next(iter(cloud.refused)))) == content(encode(place))
@@ -285,13 +285,13 @@ def test_a_robot_that_is_turned_away_says_so_and_keeps_everything(scans, alone, 
 
 def test_a_full_disk_does_not_fill_the_memory(scans, tmp_path, monkeypatch):
     def put(_self, _packets):
-        raise StateError("disk full")
+        raise InputError("disk full")
 
     monkeypatch.setattr(Outbox, "put", put)
     with Robot("alice", scans[0].laser, state=tmp_path, wiring=Wiring(SameThread())) as robot:
         for scan in scans:
             robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
-        with pytest.raises(StateError, match="disk full"):
+        with pytest.raises(InputError, match="disk full"):
             robot.finish()
         assert robot._keyscans > 5
         assert not robot._uplink._unstored

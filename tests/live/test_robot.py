@@ -155,7 +155,7 @@ def test_a_run_can_be_saved_before_the_end(robot, scans, tmp_path):
     run = robot.save(tmp_path / "run")
     assert len(run.trajectories["anna"].stamps) == 30
     drive(robot, scans[30:])
-    with pytest.raises(fcslam.OutputError, match="already holds a run"):
+    with pytest.raises(fcslam.InputError, match="already holds a run"):
         robot.save(tmp_path / "run")
     assert len(robot.save(tmp_path / "run", force=True).trajectories["anna"].stamps) == len(scans)
 

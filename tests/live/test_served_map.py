@@ -11,7 +11,7 @@ import pytest
 import uvicorn
 
 from fcslam.cli import main
-from fcslam.errors import CloudError, OutputError, SourceError
+from fcslam.errors import CloudError, InputError, SourceError
 from fcslam.live.served_map import fetch_maps
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_stem, map_yaml, pgm_bytes
 from fcslam.mission.localization import read_map
@@ -97,7 +97,7 @@ def test_a_new_copy_replaces_the_earlier_one(tmp_path):
 def test_a_folder_with_something_else_stays_as_it_is(floors, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
-    with pytest.raises(OutputError, match="exists and is not a run folder"):
+    with pytest.raises(InputError, match="exists and is not a run folder"):
         fetch_maps(tmp_path / "mine", Server(floors))
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["letter.txt"]
 

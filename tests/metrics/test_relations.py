@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.metrics.relations import (
     PoseTable,
@@ -127,7 +127,7 @@ def test_robots_in_separate_maps_leave_nothing_usable_and_no_number():
 @pytest.mark.parametrize("stamps", [[1.0, 2.0], []])
 def test_relations_of_another_recording_are_refused(stamps):
     relations = Relations(np.array([[500.0, 600.0]]), np.zeros((1, 3)))
-    with pytest.raises(EvaluationError, match="same recording"):
+    with pytest.raises(InputError, match="same recording"):
         relation_errors(relations, PoseTable.of(stamps, np.zeros((len(stamps), 3))))
 
 
@@ -158,7 +158,7 @@ def test_reads_plain_and_compressed_files(tmp_path, name, encode):
 def test_hostile_files_are_refused_with_file_and_line(tmp_path, content, message):
     path = tmp_path / "bad.relations"
     path.write_bytes(content)
-    with pytest.raises(EvaluationError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_relations(path)
     assert "bad.relations" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -171,7 +171,7 @@ def test_broken_compression_and_missing_files_are_refused(tmp_path, name):
         (tmp_path / name).write_bytes(encode(TEXT.encode() * 100)[:-20])
     elif name.startswith("noise"):
         (tmp_path / name).write_bytes(b"this is no archive")
-    with pytest.raises(EvaluationError, match="cannot read the relations"):
+    with pytest.raises(InputError, match="cannot read the relations"):
         read_relations(tmp_path / name)
 
 

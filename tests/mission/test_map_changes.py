@@ -9,7 +9,7 @@ import pytest
 import fcslam
 from fcslam.cli import main
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import OutputError, SourceError
+from fcslam.errors import InputError, SourceError
 from fcslam.maps.occupancy_map import Occupancy, parse_map
 from fcslam.mission.mission_file import as_stored, mission_bytes
 from fcslam.records import Keyscan, KeyscanId
@@ -101,12 +101,12 @@ def test_the_command_writes_grids_a_picture_and_a_table(three_days, tmp_path, ca
 
 def test_a_folder_is_replaced_with_force_only_and_only_if_it_holds_changes(three_days, tmp_path):
     fcslam.changes(three_days, output=tmp_path / "week")
-    with pytest.raises(OutputError, match="already holds changes; name a new folder or give --force"):
+    with pytest.raises(InputError, match="already holds changes; name a new folder or give --force"):
         fcslam.changes(three_days, output=tmp_path / "week")
     fcslam.changes(three_days, output=tmp_path / "week", force=True)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("dear")
-    with pytest.raises(OutputError, match="holds no changes; name a new folder"):
+    with pytest.raises(InputError, match="holds no changes; name a new folder"):
         fcslam.changes(three_days, output=tmp_path / "other", force=True)
     assert (tmp_path / "other" / "letter.txt").read_text() == "dear"
 

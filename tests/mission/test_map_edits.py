@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.report import Track
-from fcslam.errors import EditError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.mission.map_edits import moved_map, region_in_map
@@ -56,7 +56,7 @@ def test_a_map_that_is_not_there_is_named():
         lambda: region_in_map(RUN, EMPTY, 2, RegionUse.ERASE, "", TRIANGLE),
         lambda: moved_map(RUN, EMPTY, 2, np.zeros(3)),
     ):
-        with pytest.raises(EditError, match="there is no map 2; there are 0, 1"):
+        with pytest.raises(InputError, match="there is no map 2; there are 0, 1"):
             ask()
 
 

@@ -13,7 +13,7 @@ import pytest
 import fcslam
 from fcslam.cloud.edits import kind_of
 from fcslam.cloud.settings import CloudConfig, FleetConfig
-from fcslam.errors import EditError, SourceError
+from fcslam.errors import InputError, SourceError
 from fcslam.mission.localization import read_map
 from fcslam.mission.mission_file import edit_mission, mission_bytes, read_mission
 from fcslam.records import Cut, FloorLabel, ManualClosure, MapRegion, Pin, RegionUse, Removal, Undo, Veto
@@ -209,7 +209,7 @@ def test_a_truncated_mission_file_is_refused_and_stays_as_it_is(tmp_path, share)
 def test_a_wrong_edit_leaves_the_file_as_it_was(tmp_path, wrong):
     mission = tmp_path / "mission.fcslam"
     shutil.copy(GOLDEN, mission)
-    with pytest.raises(EditError) as refused:
+    with pytest.raises(InputError) as refused:
         edit_mission(mission, [Removal("ben"), wrong], "me", 0.0)
     assert "\n" not in str(refused.value)
     assert mission.read_bytes() == GOLDEN.read_bytes()
@@ -220,7 +220,7 @@ def test_no_closure_by_hand_is_made_between_floors_that_users_named(tmp_path):
     shutil.copy(GOLDEN, mission)
     edit_mission(mission, [FloorLabel("ben", "2")], "me", 0.0)
     made = ManualClosure("anna", 1000.0, "ben", 1000.0, (0.0, 0.0, 0.0), (0.1, 0.1))
-    with pytest.raises(EditError, match="different floors"):
+    with pytest.raises(InputError, match="different floors"):
         edit_mission(mission, [made], "me", 0.0)
     edit_mission(mission, [FloorLabel("anna", "2"), made], "me", 0.0)
 

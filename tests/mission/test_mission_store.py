@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fcslam.cloud.replies import NEWS_M, NEWS_RAD, SessionCorrection
-from fcslam.errors import EditError, PacketConflictError, StoreError
+from fcslam.errors import InputError, PacketConflictError, StoreError
 from fcslam.mission.mission_store import EDITS, FACTS, PACKETS, MissionStore, StoredPacket, check_mission
 from fcslam.records import Channel, Correction, Edit, Removal, Undo, Veto, frozen
 from fcslam.service.shared.mission_tables import MissionTables
@@ -213,7 +213,7 @@ def test_edits_and_requests_are_kept_in_their_order(store):
 def test_what_cannot_be_undone_changes_nothing(store, number, told):
     for content in (Veto("a", "b"), Undo(1), Removal("a")):
         store.edit(content, "boss", 0.0)
-    with pytest.raises(EditError, match=told):
+    with pytest.raises(InputError, match=told):
         store.edit(Undo(number), "boss", 0.0)
     assert len(store.edits()) == 3
 

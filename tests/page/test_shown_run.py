@@ -20,7 +20,7 @@ import pytest
 from fastapi.routing import iter_route_contexts
 
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.mission.mission_file import as_stored, mission_bytes
 from fcslam.page import ASSETS, MODULES, viewer
@@ -250,7 +250,7 @@ def test_a_report_of_a_huge_map_holds_coarse_tiles_or_none(run, tmp_path, resolu
 def test_a_report_of_what_cannot_be_shown_says_what(run, tmp_path):
     (closure,) = run.closures
     replace(run, closures=(replace(closure, T_i_j=np.full(3, np.nan)),)).save(tmp_path / "run")
-    with ShownRun(tmp_path / "run", "run") as shown, pytest.raises(EvaluationError, match="closures"):
+    with ShownRun(tmp_path / "run", "run") as shown, pytest.raises(InputError, match="closures"):
         report_html(shown)
 
 
@@ -268,7 +268,7 @@ def test_a_report_of_a_run_with_a_link_says_so(shown, tmp_path, name):
     place = tmp_path / "run" / name
     place.unlink(missing_ok=True)
     place.symlink_to(tmp_path / "private")
-    with pytest.raises(EvaluationError, match=place.name):
+    with pytest.raises(InputError, match=place.name):
         report_html(shown)
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fcslam.config import parse
-from fcslam.errors import ConfigError
+from fcslam.errors import InputError
 from fcslam.features.codes import code_words
 from fcslam.places.kmeans_tree import TreeShape, _majorities, bare_root, find_leaves, grow_tree, near_leaves
 from fcslam.places.vocabulary import Vocabulary, VocabularyConfig
@@ -171,5 +171,5 @@ def test_splits_and_merges_keep_a_tree_and_all_other_words(seed, choices):
     [({"branching": 1}, "tree.branching: .*greater than or equal to 2"), ({"depth": 0}, "tree.depth: .*equal to 1")],
 )
 def test_a_tree_that_cannot_branch_is_refused_in_one_line(tree, said):
-    with pytest.raises(ConfigError, match=f"^my.yaml: {said}.*$"):
+    with pytest.raises(InputError, match=f"^my.yaml: {said}.*$"):
         parse(VocabularyConfig, {"tree": tree}, "my.yaml")

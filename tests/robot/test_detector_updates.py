@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from fcslam.errors import FeatureError, StateError
+from fcslam.errors import FeatureError, InputError
 from fcslam.robot.detector_updates import DetectorUpdates
 from fcslam.robot.outbox import Outbox
 from tests.wire.examples import DETECTOR_UPDATE
@@ -99,7 +99,7 @@ def test_one_that_cannot_be_used_is_said_and_nothing_stops(start):
 def test_one_that_cannot_be_kept_is_one_line(start, tmp_path):
     updates, frontend = start()
     (tmp_path / "detectors").touch()
-    with pytest.raises(StateError, match=f"detectors: cannot store detector {FIRST.version}"):
+    with pytest.raises(InputError, match=f"detectors: cannot store detector {FIRST.version}"):
         updates.store(FIRST, b"network")
     assert drive(updates, frontend, range(3)) == {}
 
@@ -115,7 +115,7 @@ def test_one_that_is_kept_again_replaces_the_file_in_one_piece(start, tmp_path, 
         raise OSError("no space left")
 
     monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(StateError, match="no space left"):
+    with pytest.raises(InputError, match="no space left"):
         again.store(FIRST, b"network")
     assert [file.read_bytes() for file in (tmp_path / "detectors").glob("*.onnx")] == [b"network"]
     assert drive(again, frontend, range(20), catching_up=9) == {5: FIRST.version}

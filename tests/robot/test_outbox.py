@@ -16,7 +16,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from fcslam.errors import StateError
+from fcslam.errors import InputError
 from fcslam.robot.outbox import Outbox
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS
 from fcslam.wire.packets import decode, encode
@@ -157,7 +157,7 @@ def test_a_robot_that_was_lost_goes_on_in_the_next_epoch(outbox, path):
     assert anew.begin("r", resume=False) == 0
     anew.put(of_part(0, 0))
     assert [anew.session_of(epoch) for epoch in (0, 2, 3, 4)] == [None, None, None, 0]
-    with pytest.raises(StateError, match="differs from that of the interrupted run"):
+    with pytest.raises(InputError, match="differs from that of the interrupted run"):
         anew.put([replace(said(0, KEYSCAN), epoch=0)])
     anew.close()
 
@@ -175,7 +175,7 @@ def test_an_epoch_that_the_cloud_knows_from_before_is_not_taken_again(outbox):
 
 def test_epochs_do_not_run_out_silently(outbox):
     """Whoever has the robot's token may have used the last one."""
-    with pytest.raises(StateError, match="something else sends under its name"):
+    with pytest.raises(InputError, match="something else sends under its name"):
         outbox.synchronize({2**31 - 1: 3})
 
 
@@ -201,7 +201,7 @@ def test_a_cloud_that_lost_what_it_confirmed_is_found_out(outbox):
     outbox.synchronize({})
     outbox.acknowledge(0, 3)
     outbox.synchronize({0: 4})
-    with pytest.raises(StateError, match="has 2 of 4 packets of epoch 0"):
+    with pytest.raises(InputError, match="has 2 of 4 packets of epoch 0"):
         outbox.synchronize({0: 2})
     assert outbox.waiting.packets == 1
 
@@ -246,10 +246,10 @@ def test_what_is_resumed_must_be_the_same(outbox, path):
     outbox.put([said(0), said(1)])
     outbox.close()
     again = Outbox(path, "alice", LIMIT)
-    with pytest.raises(StateError, match="another recording"):
+    with pytest.raises(InputError, match="another recording"):
         again.begin("another", resume=True)
     again.begin("r", resume=True)
-    with pytest.raises(StateError, match="packet 1 differs from that of the interrupted run"):
+    with pytest.raises(InputError, match="packet 1 differs from that of the interrupted run"):
         again.put([said(0), said(1, LIDAR_PLACE)])
     again.close()
 
@@ -262,11 +262,11 @@ def test_where_there_is_nothing_to_resume_a_robot_starts(path):
 
 
 def test_a_folder_has_one_robot_and_one_process(outbox, path):
-    with pytest.raises(StateError, match="another process runs on it"):
+    with pytest.raises(InputError, match="another process runs on it"):
         Outbox(path, "alice", LIMIT)
     agent = outbox.agent
     outbox.close()
-    with pytest.raises(StateError, match="belongs to robot 'alice', not 'bob'"):
+    with pytest.raises(InputError, match="belongs to robot 'alice', not 'bob'"):
         Outbox(path, "bob", LIMIT)
     again = Outbox(path, "alice", LIMIT)
     assert again.agent == agent
@@ -275,9 +275,9 @@ def test_a_folder_has_one_robot_and_one_process(outbox, path):
 
 def test_no_outbox_is_one_line(tmp_path):
     (tmp_path / "outbox").write_bytes(b"noise" * 1000)
-    with pytest.raises(StateError, match="file is not a database"):
+    with pytest.raises(InputError, match="file is not a database"):
         Outbox(tmp_path / "outbox", "alice", LIMIT)
-    with pytest.raises(StateError, match="unable to open"):
+    with pytest.raises(InputError, match="unable to open"):
         Outbox(tmp_path / "nowhere" / "outbox", "alice", LIMIT)
 
 
@@ -299,7 +299,7 @@ def test_an_outbox_of_another_version_is_told_as_such(path):
     with sqlite3.connect(path) as older:
         older.execute("CREATE TABLE sessions (epoch INTEGER PRIMARY KEY, recording TEXT NOT NULL)")
     older.close()
-    with pytest.raises(StateError, match="comes from another version of fcslam; give another --state"):
+    with pytest.raises(InputError, match="comes from another version of fcslam; give another --state"):
         Outbox(path, "anna", LIMIT)
 
 
@@ -335,7 +335,7 @@ def test_a_damaged_packet_is_told_by_its_number(path):
         damaged = bytearray(content)
         damaged[content.index(data) + at] ^= 4
         path.write_bytes(damaged)
-        with pytest.raises(StateError, match=r"packet 2 of epoch 0 is damaged, .*; give another --state") as told:
+        with pytest.raises(InputError, match=r"packet 2 of epoch 0 is damaged, .*; give another --state") as told:
             Outbox(path, "alice", LIMIT)
         assert "\n" not in str(told.value)
 
@@ -348,7 +348,7 @@ def test_a_cut_outbox_is_told(path):
     content = path.read_bytes()
     for share in (0.01, 0.5, 0.99):
         path.write_bytes(content[: int(share * len(content))])
-        with pytest.raises(StateError, match=r"cannot be used: .*; give another --state") as told:
+        with pytest.raises(InputError, match=r"cannot be used: .*; give another --state") as told:
             Outbox(path, "alice", LIMIT)
         assert "\n" not in str(told.value)
 

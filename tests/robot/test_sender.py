@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fcslam.errors import CloudError, OversizeError, StateError, UnavailableError
+from fcslam.errors import CloudError, InputError, OversizeError, UnavailableError
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import ASK_AFTER_S, LONGEST_RETRY_S, SEND_INTERVAL_S, Sender, retry_delay_s
 from fcslam.wire.http_transport import HttpResponse
@@ -183,12 +183,12 @@ def test_a_refused_packet_is_set_aside_and_those_behind_it_get_through(robot):
 
 def test_a_refused_packet_stays_until_it_is_kept_elsewhere(robot):
     def no_room(*_):
-        raise StateError("no room")
+        raise InputError("no room")
 
     robot.aside = no_room
     robot.network.cloud.unwanted = {content(encode(said(1)))}
     robot.outbox.put([said(0, HELLO), said(1)])
-    with pytest.raises(StateError, match="no room"):
+    with pytest.raises(InputError, match="no room"):
         robot.step()
     assert robot.outbox.waiting.packets == 1
     assert content(robot.outbox.packet(0, 1)) == content(encode(said(1)))
@@ -271,7 +271,7 @@ def test_a_cloud_that_opens_another_mission_is_found_out_and_gets_the_next_start
     network.cloud = FakeCloud()
     before.outbox.put([said(2), said(3)])
     before.step()
-    with pytest.raises(StateError, match="its mission is another one; start anew: without --resume"):
+    with pytest.raises(InputError, match="its mission is another one; start anew: without --resume"):
         before.step()
     before.outbox.close()
     (tmp_path / "resumed").unlink()
@@ -299,7 +299,7 @@ def test_another_mission_is_found_out_though_the_cloud_takes_nothing(robot):
     robot.outbox.put([said(2)])
     robot.step()
     assert "far ahead" in robot.sender.trouble
-    with pytest.raises(StateError, match="its mission is another one"):
+    with pytest.raises(InputError, match="its mission is another one"):
         robot.step()
 
 

@@ -8,7 +8,7 @@ import pytest
 from worlds.wall_tags import WallTag, draw_tags
 
 from fcslam.config import parse
-from fcslam.errors import ConfigError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.simulation.simulated_fleet import CameraSettings
 from fcslam.records import CameraImage, KeyscanId, TagFamily
@@ -99,6 +99,6 @@ def test_aruco_tags_are_read():
     ],
 )
 def test_bad_settings_get_one_line(settings, reason):
-    with pytest.raises(ConfigError, match=reason) as error:
+    with pytest.raises(InputError, match=reason) as error:
         parse(RobotConfig, settings, "robot")
     assert "\n" not in str(error.value)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fcslam.config import parse
-from fcslam.errors import ConfigError, FeatureError
+from fcslam.errors import FeatureError, InputError
 from fcslam.features.birdseye import DETECTOR_VERSION
 from fcslam.maps.fusion import joined_tiles, laid_together
 from fcslam.maps.occupancy_map import OccupancyMap
@@ -69,10 +69,10 @@ def test_a_known_cell_outlasts_an_unknown_one_and_a_wall_free_space():
 
 
 def test_words_need_a_vocabulary_and_a_cloud_without_geometry():
-    with pytest.raises(ConfigError, match="fcslam tools vocabulary"):
+    with pytest.raises(InputError, match="fcslam tools vocabulary"):
         parse(RobotConfig, {"sends": "words"}, "test")
     words = {"robot": {"sends": "words", "words": {"vocabulary": "x"}}}
-    with pytest.raises(ConfigError, match="similarity"):
+    with pytest.raises(InputError, match="similarity"):
         parse(MissionConfig, words, "test")
 
 

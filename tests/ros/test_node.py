@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fcslam
-from fcslam.errors import NetworkError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.live.fleet_view import Teammate
 from fcslam.live.records import Wiring
@@ -125,7 +125,7 @@ def test_what_is_offered_reliably_is_asked_for_reliably(network, robot):
 
 def test_a_second_robot_of_one_name_is_refused(network, robot):
     network.others.append(offered("/robot1/map", "nav_msgs/OccupancyGrid"))
-    with pytest.raises(NetworkError, match="another node publishes /robot1/map: a second robot of this name"):
+    with pytest.raises(InputError, match="another node publishes /robot1/map: a second robot of this name"):
         start(network, robot)
 
 
@@ -164,7 +164,7 @@ def test_a_robot_of_the_same_name_that_comes_later_is_told_once(network, robot):
 
 
 def test_missing_topics_end_the_wait():
-    with pytest.raises(NetworkError, match="there are no topics"):
+    with pytest.raises(InputError, match="there are no topics"):
         await_sensors(MemoryNetwork(), "/robot1", BagOptions(), 0.0, 0.0)
 
 

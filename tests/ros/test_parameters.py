@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fcslam.errors import ConfigError, NetworkError
+from fcslam.errors import InputError
 from fcslam.ros.parameters import NodeParameters, load_parameters
 from fcslam.ros.ros2 import configuration
 
@@ -29,7 +29,7 @@ def test_the_shipped_file_holds_every_parameter_with_its_default():
 def test_files_that_cannot_be_used(tmp_path, text, said):
     path = tmp_path / "parameters.yaml"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(InputError, match=said):
         load_parameters(path)
 
 
@@ -56,5 +56,5 @@ def test_the_middleware_is_configured_as_ros_2_is():
 
 
 def test_a_peer_that_is_no_address_is_refused():
-    with pytest.raises(NetworkError, match="ROS_STATIC_PEERS has"):
+    with pytest.raises(InputError, match="ROS_STATIC_PEERS has"):
         configuration({"ROS_STATIC_PEERS": '"/><Domain>'})

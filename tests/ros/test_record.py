@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.errors import NetworkError, OutputError
+from fcslam.errors import InputError
 from fcslam.records import LaserScan
 from fcslam.ros.inbox import Inbox
 from fcslam.ros.node import await_sensors
@@ -52,7 +52,7 @@ def recorded(network, output, messages):
     def write():
         try:
             record(network, topics, output, stop, said.append)
-        except OutputError as error:
+        except InputError as error:
             said.append(str(error))
 
     thread = threading.Thread(target=write, daemon=True)
@@ -118,7 +118,7 @@ def test_messages_that_the_reader_cannot_take_are_counted():
 
 def test_a_missing_middleware_is_told_with_the_command_that_installs_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
-    with pytest.raises(NetworkError, match="install it: ") as caught:
+    with pytest.raises(InputError, match="install it: ") as caught:
         Ros2Network(0, {})
     assert str(caught.value).endswith(INSTALL)
 

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from fcslam.errors import NetworkError
+from fcslam.errors import InputError
 from fcslam.records import CameraImage, GnssFix
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.ros import sensors
@@ -332,7 +332,7 @@ def test_two_lasers_of_one_frame_are_refused():
     robot = two_lasers()
     for stamp in np.arange(1.0, 9.0):
         robot.hears("/scan", scan(stamp, RANGES)).hears("/rear", scan(stamp, RANGES))
-    with pytest.raises(NetworkError, match="the scans of /scan and /rear have one frame"):
+    with pytest.raises(InputError, match="the scans of /scan and /rear have one frame"):
         robot.hears("/odom", odometry(1.0, (0.0, 0.0, 0.0)))
 
 
@@ -341,7 +341,7 @@ def test_a_tilted_laser_is_refused():
     lying = transform(0.0, "base_link", "laser")
     lying.transforms[0].transform.rotation = type(lying.transforms[0].transform.rotation)(x=0.7071, y=0, z=0, w=0.7071)
     robot.hears("/tf_static", lying)
-    with pytest.raises(NetworkError, match="tilted by 90 degrees"):
+    with pytest.raises(InputError, match="tilted by 90 degrees"):
         robot.drives(np.arange(1.0, 9.0))
 
 

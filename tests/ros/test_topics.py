@@ -2,7 +2,7 @@
 
 import pytest
 
-from fcslam.errors import NetworkError
+from fcslam.errors import InputError
 from fcslam.ros.addresses import RosAddress, open_network, parse_address
 from fcslam.ros.topics import choose_sensor_topics
 from fcslam.sources import BagOptions
@@ -84,12 +84,12 @@ def test_named_topics_may_be_relative_or_of_tf():
     ],
 )
 def test_a_missing_topic_is_told_with_those_that_are_there(options, said):
-    with pytest.raises(NetworkError, match=said):
+    with pytest.raises(InputError, match=said):
         choose(("/robot1/odom", ODOMETRY), **options)
 
 
 def test_an_empty_network_is_told():
-    with pytest.raises(NetworkError, match="there are no topics"):
+    with pytest.raises(InputError, match="there are no topics"):
         choose()
 
 
@@ -97,13 +97,13 @@ def test_addresses():
     assert parse_address("ros2:/robot1") == RosAddress("ros2", "/robot1")
     assert parse_address("zenoh:/").namespace == parse_address("ros2:").namespace == ""
     assert parse_address("ros2:/fleet/anna/").robot == "anna"
-    with pytest.raises(NetworkError, match="'robot1' is not a namespace; give one as in ros2:/robot1"):
+    with pytest.raises(InputError, match="'robot1' is not a namespace; give one as in ros2:/robot1"):
         parse_address("ros2:robot1")
 
 
 @pytest.mark.parametrize("domain", ["233", "-1"])
 def test_a_domain_out_of_range(domain):
-    with pytest.raises(NetworkError, match="is not a ROS 2 domain"):
+    with pytest.raises(InputError, match="is not a ROS 2 domain"):
         open_network(RosAddress("ros2", ""), {"ROS_DOMAIN_ID": domain})
 
 

@@ -8,7 +8,7 @@ from concurrent.futures import Future
 import numpy as np
 import pytest
 
-from fcslam.errors import NetworkError
+from fcslam.errors import InputError
 from fcslam.ros.network import Answer, Endpoint, Quality
 from fcslam.ros.ros2_zenoh import ZenohNetwork, attachment, endpoint_of, quality_text, session_config
 from fcslam.sources.bags.codec import SCAN, TRANSFORMS
@@ -134,7 +134,7 @@ def test_the_bridge_shows_itself_as_a_node_of_ros(network, peer):
 
 
 def test_a_missing_router_is_one_line():
-    with pytest.raises(NetworkError, match=r"no Zenoh router answers at .*tcp/127.0.0.1:9.*rmw_zenohd"):
+    with pytest.raises(InputError, match=r"no Zenoh router answers at .*tcp/127.0.0.1:9.*rmw_zenohd"):
         ZenohNetwork(0, {"ZENOH_CONFIG_OVERRIDE": 'connect/endpoints=["tcp/127.0.0.1:9"]'})
 
 
@@ -147,7 +147,7 @@ def test_a_missing_router_is_one_line():
     ],
 )
 def test_a_configuration_that_cannot_be_used(environment, said):
-    with pytest.raises(NetworkError, match=said):
+    with pytest.raises(InputError, match=said):
         session_config(environment)
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.learning.federated.history import ROUNDS_FILE, RoundReport, write_rows
 from fcslam.service import summaries
 from fcslam.service.summaries import MOST_ROUNDS, read_rounds
@@ -31,7 +31,7 @@ def test_before_the_first_round_there_is_none(tmp_path):
 )
 def test_a_damaged_table_is_refused(tmp_path, content):
     (tmp_path / ROUNDS_FILE).write_bytes(content)
-    with pytest.raises(EvaluationError, match="not a table of rounds"):
+    with pytest.raises(InputError, match="not a table of rounds"):
         read_rounds(tmp_path)
 
 

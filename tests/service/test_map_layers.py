@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fcslam import untrusted
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.maps.exports import outlines
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.mission.mission_file import stored_mission
@@ -108,7 +108,7 @@ def test_packets_that_expand_too_much_are_not_decoded_and_read_once(tmp_path, re
     with ShownRun(write_run(tmp_path / "bomb", (0, 1)), "bomb") as shown:
         monkeypatch.setattr(untrusted, "FREE_BYTES", -(10**12))
         for _ in range(2):
-            with pytest.raises(EvaluationError, match="limit"):
+            with pytest.raises(InputError, match="limit"):
                 map_shapes(shown, 0, MapLayer.CHANGES)
     assert len(reads) == 1
 
@@ -147,7 +147,7 @@ def test_a_broken_file_is_named(tmp_path, monkeypatch, content):
     (folder / "plan.json").write_text(content)
     if content.isspace():
         monkeypatch.setattr(map_layers, "MOST_LAYER_BYTES", 4000)
-    with ShownRun(folder, "broken") as shown, pytest.raises(EvaluationError, match=r"plan\.json"):
+    with ShownRun(folder, "broken") as shown, pytest.raises(InputError, match=r"plan\.json"):
         map_shapes(shown, 0, MapLayer.PLAN)
 
 
@@ -155,7 +155,7 @@ def test_a_file_that_is_a_link_is_not_followed(tmp_path):
     folder = write_run(tmp_path / "linked", (0,))
     (tmp_path / "other.json").write_text(json.dumps(TAGS))
     (folder / "tags.json").symlink_to(tmp_path / "other.json")
-    with ShownRun(folder, "linked") as shown, pytest.raises(EvaluationError, match=r"tags\.json"):
+    with ShownRun(folder, "linked") as shown, pytest.raises(InputError, match=r"tags\.json"):
         map_shapes(shown, 0, MapLayer.TAGS)
 
 

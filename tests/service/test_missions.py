@@ -5,7 +5,7 @@ import os
 import pytest
 
 from fcslam.cloud.settings import CloudConfig, FleetConfig
-from fcslam.errors import ServiceError, StoreError
+from fcslam.errors import InputError, StoreError
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import Missions
 
@@ -93,7 +93,7 @@ def test_a_mission_whose_vocabulary_is_no_file_is_refused_by_name(tmp_path, kind
         path.mkdir()
     launched = []
     config = CloudConfig(fleet=FleetConfig(vocabularies=(path,)))
-    with pytest.raises(ServiceError, match=r"mission 'mission': .*building\.words"):
+    with pytest.raises(InputError, match=r"mission 'mission': .*building\.words"):
         Missions(tmp_path / "data", config, lambda: 0.0, lambda: 1e9, launched.append)
     assert launched == []
 

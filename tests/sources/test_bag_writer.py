@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
 
-from fcslam.errors import OutputError, SourceError
+from fcslam.errors import InputError, SourceError
 from fcslam.records import LaserModel, LaserScan, Odometry, Sweep, frozen
 from fcslam.sources import open_source, write_bag
 from tests.sources.bag_messages import BEAMS, ROS1, ROS2, drive, save
@@ -191,14 +191,14 @@ def test_a_file_is_replaced_when_the_new_one_is_complete(tmp_path):
 def test_what_cannot_be_written_is_reported(tmp_path, name):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
-    with pytest.raises(OutputError, match=r"full|missing|run\.zip"):
+    with pytest.raises(InputError, match=r"full|missing|run\.zip"):
         write_bag(tmp_path / name, straight(2))
 
 
 @pytest.mark.parametrize("stamp", [-1.0, 2.0**31, math.nan])
 def test_stamps_that_ros_does_not_have(tmp_path, stamp):
     one = frozen(np.ones(12), np.float32)
-    with pytest.raises(OutputError, match="ROS counts from 0 s"):
+    with pytest.raises(InputError, match="ROS counts from 0 s"):
         write_bag(tmp_path / "run.bag", [LaserScan(stamp, one, ROUND, frozen((0, 0, 0)))])
     assert list(tmp_path.iterdir()) == []
 

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.features.codes import mutual_matches
 from fcslam.features.detector import FeatureDetector
 from fcslam.learning.homography import (
@@ -47,11 +47,11 @@ def held_out_pairs(robot: str, files: Sequence[ImageFile], count: int) -> list[V
     """Pairs of views of a robot's images that no arm trains on; always the same.
 
     Raises:
-        EvaluationError: none of the images is usable.
+        InputError: none of the images is usable.
     """
     images = [image for file in files if (image := read_image(file.path)) is not None and is_usable(image)]
     if not images:
-        raise EvaluationError(f"{robot}: none of its {len(files)} test images is usable; give more images")
+        raise InputError(f"{robot}: none of its {len(files)} test images is usable; give more images")
     unlabelled = Labels(np.zeros((0, 2), np.float32), np.zeros(0, np.float32))
     pairs = []
     for index in range(count):

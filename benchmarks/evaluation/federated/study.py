@@ -78,7 +78,7 @@ class Arm:
         """The settings of this arm.
 
         Raises:
-            ConfigError: ``settings`` names something that is not a setting.
+            InputError: ``settings`` names something that is not a setting.
         """
         content = common.model_dump() | dict(self.settings)
         content["training"] = dict(content["training"]) | {"seed": seed}
@@ -142,9 +142,9 @@ def run_study(study: Study) -> StudyResults:
     """Train and measure everything that is not measured yet.
 
     Raises:
-        EvaluationError: a robot has no usable test image.
-        TrainingError: a robot has too few images, or the folder belongs to another study.
-        OutputError: a file cannot be written.
+        InputError: a robot has no usable test image.
+        InputError: a robot has too few images, or the folder belongs to another study.
+        InputError: a file cannot be written.
     """
     share = -(-study.pairs // len(study.robots))
     pairs = [pair for robot in study.robots for pair in held_out_pairs(robot, _files(study, robot)[1], share)]

@@ -11,7 +11,7 @@ import typer
 from fcslam.cli.options import BuildingSeed, Live, NoCamera, PathLength, Quiet
 from fcslam.cli.output import notices, print_line
 from fcslam.cli.show import live_page
-from fcslam.errors import OutputError
+from fcslam.errors import InputError
 from fcslam.lab.simulation.options import Scanner
 
 RECORDINGS, RUN, TABLE = "recordings", "run", "evaluation.csv"
@@ -79,7 +79,7 @@ def _prepare(output: Path) -> None:
     try:
         output.mkdir(parents=True, exist_ok=True)
         if any(output.iterdir()) and not (output / ABOUT).is_file():
-            raise OutputError(
+            raise InputError(
                 f"{output}: holds something that is not a demo; remove it, or name another folder with --output"
             )
         names = (RECORDINGS, RUN, TABLE)
@@ -92,4 +92,4 @@ def _prepare(output: Path) -> None:
             else:
                 place.unlink(missing_ok=True)
     except OSError as error:
-        raise OutputError(f"{output}: cannot be used as the output folder ({error})") from error
+        raise InputError(f"{output}: cannot be used as the output folder ({error})") from error

@@ -19,7 +19,7 @@ from fcslam.cli.training_options import (
     compute_budget,
     require_training_libraries,
 )
-from fcslam.errors import PacketError, ServiceError, TrainingError
+from fcslam.errors import InputError, PacketError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -121,7 +121,7 @@ def serve(
     tokens, certificate, key = find_files(credentials)
     tls = None if certificate is None or key is None else (certificate, key)
     if insecure == (tokens is not None and tls is not None):
-        raise ServiceError(
+        raise InputError(
             "give --credentials with tokens.yaml, cloud.pem and cloud.key, or --insecure in a network of your own"
         )
     check_tls(certificate, key)
@@ -167,12 +167,12 @@ def join(
     from fcslam.wire.keys import NO_CREDENTIALS, read_credentials
 
     if not images.is_dir():
-        raise TrainingError(f"{images}: is not a folder; give the folder of the robot's images")
+        raise InputError(f"{images}: is not a folder; give the folder of the robot's images")
     robot = images.resolve().name if name is None else name
     try:
         check_name(robot, "robot")
     except PacketError as error:
-        raise TrainingError(f"{error}; give another --name") from error
+        raise InputError(f"{error}; give another --name") from error
     found = NO_CREDENTIALS if credentials is None else read_credentials(credentials)
     client = RobotClient(robot, images, output / "labels", compute_budget().device)
     with RobotLink(server, robot, replace(found, own=None)) as link:
@@ -232,5 +232,5 @@ def _host_and_port(address: str) -> tuple[str, int]:
     """Host and port of ``HOST:PORT``; brackets around an IPv6 address are removed."""
     host, colon, port = address.rpartition(":")
     if not (colon and host.strip("[]") and port.isdecimal() and 0 < int(port) < 65536):
-        raise TrainingError(f"{address}: is not a HOST:PORT")
+        raise InputError(f"{address}: is not a HOST:PORT")
     return host.strip("[]"), int(port)

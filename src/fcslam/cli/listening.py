@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fcslam.errors import ServiceError
+from fcslam.errors import InputError
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -16,7 +16,7 @@ def listen(host: str, port: int) -> socket.socket:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=512)
     except (OSError, UnicodeError) as error:
-        raise ServiceError(f"cannot listen on {host}:{port} ({error}); choose another --port or --host") from error
+        raise InputError(f"cannot listen on {host}:{port} ({error}); choose another --port or --host") from error
 
 
 Credentials = Annotated[
@@ -37,7 +37,7 @@ def find_files(folder: Path | None) -> tuple[Path | None, Path | None, Path | No
     names = "tokens.yaml", "cloud.pem", "cloud.key"
     tokens, certificate, key = (folder / name if os.path.exists(folder / name) else None for name in names)
     if not (tokens or certificate or key):
-        raise ServiceError(f"{folder}: holds neither tokens.yaml nor cloud.pem; `fcslam tools certificates` makes them")
+        raise InputError(f"{folder}: holds neither tokens.yaml nor cloud.pem; `fcslam tools certificates` makes them")
     return tokens, certificate, key
 
 
@@ -48,19 +48,19 @@ def check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None
     from fcslam.wire.keys import no_passphrase
 
     if (certificate is None) != (key is None):
-        raise ServiceError("--credentials: cloud.pem and cloud.key belong together; add the other one")
+        raise InputError("--credentials: cloud.pem and cloud.key belong together; add the other one")
     if certificate is None or key is None:
         if client_ca is not None:
-            raise ServiceError("--client-ca needs TLS; give --credentials with cloud.pem and cloud.key")
+            raise InputError("--client-ca needs TLS; give --credentials with cloud.pem and cloud.key")
         return
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     try:
         context.load_cert_chain(certificate, key, no_passphrase)
     except (OSError, ssl.SSLError) as error:
-        raise ServiceError(f"{certificate}, {key}: no certificate with its key ({error})") from error
+        raise InputError(f"{certificate}, {key}: no certificate with its key ({error})") from error
     if client_ca is None:
         return
     try:
         context.load_verify_locations(client_ca)
     except (OSError, ssl.SSLError) as error:
-        raise ServiceError(f"{client_ca}: no certificate authority can be read ({error})") from error
+        raise InputError(f"{client_ca}: no certificate authority can be read ({error})") from error

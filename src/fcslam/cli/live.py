@@ -14,7 +14,7 @@ import typer
 from fcslam.cli.inputs import LiveSource, print_faults
 from fcslam.cli.output import RUNS, new_folder, print_line
 from fcslam.cli.warm_up import compiled
-from fcslam.errors import CloudError, FcslamError, StateError
+from fcslam.errors import FcslamError, InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -121,7 +121,7 @@ def _finish(robot: "Robot", notify: Callable[[str], None]) -> FcslamError | None
     try:
         if not robot.finish(SERVER_PATIENCE_S):
             notify("the server does not have everything; the rest is sent at the next start with the same --state")
-    except (CloudError, StateError) as error:
+    except InputError as error:
         return error
     return None
 
@@ -144,7 +144,7 @@ def standstill_learning(
         def stop() -> None:
             try:
                 robot.idle()
-            except (CloudError, StateError):  # an event named it; the robot maps on, but does not learn
+            except InputError:  # an event named it; the robot maps on, but does not learn
                 return
             learning.set_idle(True)
 

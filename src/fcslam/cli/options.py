@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fcslam.cli.inputs import pose
-from fcslam.errors import ConfigError
+from fcslam.errors import InputError
 from fcslam.lab.presets import Preset
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ def chosen_settings(
         try:
             content: Any = parse_yaml(text)
         except ValueError as error:
-            raise ConfigError(f"--config {key}: {error}") from error
+            raise InputError(f"--config {key}: {error}") from error
         for part in reversed(key.split(".")):
             content = {part: content}
         settings = changed(settings, content, "--config")
@@ -180,6 +180,6 @@ def with_starts(config: "MissionConfig", starts: Sequence[str] | None) -> "Missi
 
     named = [start.partition("=")[::2] for start in starts or ()]
     if len(dict(named)) < len(named):
-        raise ConfigError("--start: a robot is given two starts; give one for each")
+        raise InputError("--start: a robot is given two starts; give one for each")
     poses = {name: pose(f"--start {name}=", numbers) for name, numbers in named}
     return changed(config, {"fleet": {"starts": poses}}, "the command line") if poses else config

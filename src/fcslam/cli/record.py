@@ -14,7 +14,7 @@ from fcslam.cli.inputs import is_live, live_source, open_recording, print_faults
 from fcslam.cli.live import stopping
 from fcslam.cli.options import Force, Quiet, Sensors
 from fcslam.cli.output import notices, print_line
-from fcslam.errors import InputError, OutputError
+from fcslam.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -69,7 +69,7 @@ def _record(live: "LiveSource", output: Path, duration: float | None, force: boo
 
     place = live.address
     if output.suffix != ".mcap":
-        raise OutputError(f"{output}: a recording of a live robot is a .mcap file; choose such a name")
+        raise InputError(f"{output}: a recording of a live robot is a .mcap file; choose such a name")
     _prepare(output, force)
     stop = Event()
     with closing(open_network(place)) as network:
@@ -99,15 +99,15 @@ def _prepare(output: Path, force: bool) -> None:
     from fcslam.sources import BAG_SUFFIXES
 
     if output.suffix not in BAG_SUFFIXES:
-        raise OutputError(f"{output}: unknown format; give .mcap, .db3, .bag, or no suffix for a folder")
+        raise InputError(f"{output}: unknown format; give .mcap, .db3, .bag, or no suffix for a folder")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         if output.exists() and not force:
-            raise OutputError(f"{output}: exists; choose another name or give --force to replace it")
+            raise InputError(f"{output}: exists; choose another name or give --force to replace it")
         if output.is_dir() and (output.suffix or not (output / "metadata.yaml").is_file()):
-            raise OutputError(f"{output}: is a folder, not a recording; choose another name")
+            raise InputError(f"{output}: is a folder, not a recording; choose another name")
     except OSError as error:
-        raise OutputError(f"{output}: cannot be written ({error}); choose another place") from error
+        raise InputError(f"{output}: cannot be written ({error}); choose another place") from error
 
 
 def _write(output: Path, records: "Iterable[SensorRecord]") -> None:
@@ -122,7 +122,7 @@ def _write(output: Path, records: "Iterable[SensorRecord]") -> None:
                 shutil.rmtree(output)
             whole.replace(output)
     except OSError as error:
-        raise OutputError(f"{output}: cannot be written ({error}); choose another place") from error
+        raise InputError(f"{output}: cannot be written ({error}); choose another place") from error
 
 
 def _with_progress(source: "Source", total: int, console: "Console") -> "Iterator[SensorRecord]":

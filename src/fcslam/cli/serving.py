@@ -18,7 +18,7 @@ from fastapi import FastAPI
 from fcslam.cli.training_options import LEARNING_FILE, require_training_libraries
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import load
-from fcslam.errors import FcslamError, ServiceError
+from fcslam.errors import FcslamError, InputError
 from fcslam.learning.federated.settings import RELEASE, FleetLearningSettings
 from fcslam.learning.settings import DETECTOR
 from fcslam.processes import Child, module_command
@@ -51,9 +51,9 @@ _log = logging.getLogger("fcslam.service")
 def check_open(host: str, credentials: Path | None) -> None:
     """Check that a service may go without authentication."""
     if not is_loopback(host):
-        raise ServiceError(f"everybody who reaches {host} could send and read; give --credentials, or --insecure")
+        raise InputError(f"everybody who reaches {host} could send and read; give --credentials, or --insecure")
     if credentials is not None:
-        raise ServiceError(
+        raise InputError(
             f"{credentials}: holds no tokens.yaml, so everybody could send and read; `fcslam tools certificates` adds "
             "it; or give --client-ca or --insecure"
         )
@@ -84,7 +84,7 @@ def shared_state(
     missions_here = _limit("FCSLAM_MAX_MISSIONS", 0, MAX_MISSIONS)
     robots_here = _limit("FCSLAM_MAX_ROBOTS", 1, MAX_ROBOTS)
     if not is_server(store):
-        raise ServiceError("--store: not the address of a database; write postgresql://USER@HOST:PORT/DATABASE")
+        raise InputError("--store: not the address of a database; write postgresql://USER@HOST:PORT/DATABASE")
     url = take_password(store)
     with ExitStack() as opened:
         server = opened.enter_context(closing(Postgres(url, name)))
@@ -110,7 +110,7 @@ def shared_state(
 def _limit(variable: str, least: int, otherwise: int) -> int:
     text = os.environ.get(variable) or str(otherwise)
     if not (text.isdecimal() and int(text) >= least):
-        raise ServiceError(f"{variable}={text}: is not a number from {least} on")
+        raise InputError(f"{variable}={text}: is not a number from {least} on")
     return int(text)
 
 
@@ -164,7 +164,7 @@ def learning_settings(data: Path, store: str | None) -> FleetLearningSettings:
         store: database of the missions; None: they are files.
     """
     if store is not None:
-        raise ServiceError("--learn works with missions in --data; leave out --store")
+        raise InputError("--learn works with missions in --data; leave out --store")
     config = data / LEARNING_FILE
     settings = load(FleetLearningSettings, config) if config.exists() else FleetLearningSettings()
     require_training_libraries()

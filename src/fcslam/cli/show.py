@@ -14,7 +14,7 @@ import typer
 
 from fcslam.cli.listening import listen
 from fcslam.cli.options import Force
-from fcslam.errors import InputError, OutputError
+from fcslam.errors import InputError
 
 if TYPE_CHECKING:
     from fcslam.page.live_map import LiveMap
@@ -47,7 +47,7 @@ def show(
     from fcslam.storage.files import write_file
 
     if html is not None and html.exists() and not (force and html.is_file()):
-        raise OutputError(f"{html}: exists; name a new file, or give --force to replace it")
+        raise InputError(f"{html}: exists; name a new file, or give --force to replace it")
     _check(run)
     with ShownRun(run, run.resolve().name) as shown:
         if html is not None:
@@ -55,7 +55,7 @@ def show(
             try:
                 write_file(html, content)
             except OSError as error:
-                raise OutputError(f"{html}: cannot be written ({error})") from error
+                raise InputError(f"{html}: cannot be written ({error})") from error
             typer.echo(f"report of {run}: {html} ({len(content) / 1e6:.1f} MB)")
             return
         from fcslam.page.viewer import ReadOnly, run_viewer, viewer_app

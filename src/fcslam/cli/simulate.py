@@ -12,7 +12,7 @@ import typer
 
 from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, chosen_settings, output_option
 from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
-from fcslam.errors import OutputError
+from fcslam.errors import InputError
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, console: "Console") -> l
         try:
             write_ground_truth(fleet, output)
         except OSError as error:
-            raise OutputError(f"{output}: cannot be written ({error}); make room or choose another place") from error
+            raise InputError(f"{output}: cannot be written ({error}); make room or choose another place") from error
     _report(fleet, recordings, time.perf_counter() - began, console)
     return recordings
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.errors import InputError, TrainingError
+from fcslam.errors import InputError
 
 if TYPE_CHECKING:
     from fcslam.learning.federated.learning_process import RobotLearningPlan
@@ -46,10 +46,10 @@ QUICK_VALIDATION_PAIRS = 2
 
 
 def require_training_libraries(*others: str, extra: str = "train") -> None:
-    """Raise TrainingError if a library that training needs, or one of ``others``, is missing."""
+    """Raise InputError if a library that training needs, or one of ``others``, is missing."""
     missing = [name for name in ("torch", "onnx", "onnxruntime", "matplotlib", *others) if find_spec(name) is None]
     if missing:
-        raise TrainingError(f"training needs {', '.join(missing)}; install it with: pip install 'fcslam[{extra}]'")
+        raise InputError(f"training needs {', '.join(missing)}; install it with: pip install 'fcslam[{extra}]'")
 
 
 def compute_budget(quick: bool = False) -> "ExecutionOptions":
@@ -62,7 +62,7 @@ def compute_budget(quick: bool = False) -> "ExecutionOptions":
     try:
         torch.zeros(1, device=device)
     except RuntimeError as error:
-        raise TrainingError(
+        raise InputError(
             f"the GPU that CUDA names cannot be used ({error}); set CUDA_VISIBLE_DEVICES to nothing to train without"
         ) from error
     threads = 1 if device == "cpu" else max((os.cpu_count() or 2) - 1, 1)

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.config import one_line
-from fcslam.errors import EditError
+from fcslam.errors import InputError
 from fcslam.records import (
     FLOOR,
     NAME,
@@ -74,15 +74,15 @@ def check_undo(edits: Sequence[Edit], number: int) -> None:
     """Check that edit ``number`` can be undone.
 
     Raises:
-        EditError: it is not there, is an undo, or was undone before.
+        InputError: it is not there, is an undo, or was undone before.
     """
     named = next((edit for edit in edits if edit.number == number), None)
     if named is None:
-        raise EditError(f"there is no edit {number}; there are {len(edits)}")
+        raise InputError(f"there is no edit {number}; there are {len(edits)}")
     if isinstance(named.content, Undo):
-        raise EditError(f"edit {number} undoes edit {named.content.number}; make that edit again instead")
+        raise InputError(f"edit {number} undoes edit {named.content.number}; make that edit again instead")
     if number in (gone := undone(edits)):
-        raise EditError(f"edit {number} was undone before, by edit {gone[number]}")
+        raise InputError(f"edit {number} was undone before, by edit {gone[number]}")
 
 
 def is_removed(session: str, changes: Iterable[Change]) -> bool:
@@ -147,7 +147,7 @@ def read_edit(kind: str, content: str) -> Change | Undo:
     """The content of an edit of this kind, checked.
 
     Raises:
-        EditError: it is not what ``edit_json`` writes, or cannot be meant.
+        InputError: it is not what ``edit_json`` writes, or cannot be meant.
     """
     try:
         _KINDS[kind](**json.loads(content))  # refuses names that the kind does not have
@@ -155,9 +155,9 @@ def read_edit(kind: str, content: str) -> Change | Undo:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise EditError(f"not a valid edit of kind '{kind}' ({where}: {first['msg']})") from error
+        raise InputError(f"not a valid edit of kind '{kind}' ({where}: {first['msg']})") from error
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise EditError(
+        raise InputError(
             f"not a valid edit of kind '{kind}' ({type(error).__name__}: {one_line(str(error))})"
         ) from error
     check_edit(edit)
@@ -168,18 +168,18 @@ def check_edit(content: Change | Undo) -> None:
     """Check the numbers and names of an edit.
 
     Raises:
-        EditError: one cannot be meant.
+        InputError: one cannot be meant.
     """
     if not all(isfinite(number) for number in _numbers(asdict(content))):
-        raise EditError("a number of the edit is not finite")
+        raise InputError("a number of the edit is not finite")
     unnamed = next((name for name in sessions_of(content) if not NAME.fullmatch(name)), None)
     if unnamed is not None:
-        raise EditError(f"'{unnamed[:LONGEST_NAME]}' is not a name of a session")
+        raise InputError(f"'{unnamed[:LONGEST_NAME]}' is not a name of a session")
     match content:
         case Removal() if not 0 <= (content.epoch or 0) <= MAXIMUM_EPOCH:
-            raise EditError(f"epoch {content.epoch}: it must be from 0 to {MAXIMUM_EPOCH}")
+            raise InputError(f"epoch {content.epoch}: it must be from 0 to {MAXIMUM_EPOCH}")
         case Cut() if content.last_s <= content.first_s:
-            raise EditError(f"the stretch ends at {content.last_s:.3f} s, before it begins at {content.first_s:.3f} s")
+            raise InputError(f"the stretch ends at {content.last_s:.3f} s, before it begins at {content.first_s:.3f} s")
         case ManualClosure():
             _check_closure(content)
         case Placement():
@@ -187,7 +187,7 @@ def check_edit(content: Change | Undo) -> None:
         case MapRegion():
             _check_region(content)
         case FloorLabel() if not FLOOR.fullmatch(content.floor):
-            raise EditError(f"floor '{content.floor[:LONGEST_NAME]}' is not 1 to 16 of A-Z a-z 0-9 . _ + -")
+            raise InputError(f"floor '{content.floor[:LONGEST_NAME]}' is not 1 to 16 of A-Z a-z 0-9 . _ + -")
 
 
 def _check_closure(closure: ManualClosure) -> None:
@@ -197,37 +197,37 @@ def _check_closure(closure: ManualClosure) -> None:
         for given, least, most in zip(closure.tolerance, LEAST_TOLERANCE, MOST_TOLERANCE, strict=True)
     ):
         (least_m, least_rad), (most_m, most_rad) = LEAST_TOLERANCE, MOST_TOLERANCE
-        raise EditError(f"the tolerance must be {least_m} to {most_m:g} m and {least_rad} to {most_rad:g} rad")
+        raise InputError(f"the tolerance must be {least_m} to {most_m:g} m and {least_rad} to {most_rad:g} rad")
     if closure.robot_i == closure.robot_j and closure.stamp_i == closure.stamp_j:
-        raise EditError("a closure connects two different keyscans")
+        raise InputError("a closure connects two different keyscans")
 
 
 def check_polygon(corners: Sequence[tuple[float, float]]) -> None:
     """Check that a polygon of corners (x, y), metres, has an inside.
 
     Raises:
-        EditError: it has not, or a coordinate is out of range.
+        InputError: it has not, or a coordinate is out of range.
     """
     if not 3 <= len(corners) <= MOST_CORNERS:
-        raise EditError(f"a polygon has 3 to {MOST_CORNERS} corners, not {len(corners)}")
+        raise InputError(f"a polygon has 3 to {MOST_CORNERS} corners, not {len(corners)}")
     _check_coordinates(chain.from_iterable(corners))
     x, y = np.array(corners).T
     x, y = x - x[0], y - y[0]
     if abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) < 2.0 * LEAST_AREA_M2:
-        raise EditError("the polygon has no inside; give corners that are not on one line")
+        raise InputError("the polygon has no inside; give corners that are not on one line")
 
 
 def _check_region(region: MapRegion) -> None:
     check_polygon(region.polygon)
     if len(region.name) > LONGEST_NAME or not region.name.isprintable():
-        raise EditError(f"a name has at most {LONGEST_NAME} printable characters")
+        raise InputError(f"a name has at most {LONGEST_NAME} printable characters")
     if region.use is RegionUse.AREA and not region.name.strip():
-        raise EditError("an area needs a name")
+        raise InputError("an area needs a name")
 
 
 def _check_coordinates(coordinates: Iterable[float]) -> None:
     if not all(abs(number) <= LARGEST_M for number in coordinates):  # false for NaN
-        raise EditError(f"a coordinate is over {LARGEST_M:g} m")
+        raise InputError(f"a coordinate is over {LARGEST_M:g} m")
 
 
 def _numbers(content: Any) -> Iterable[float]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fcslam.errors import TrainingError, writing
+from fcslam.errors import InputError, writing
 from fcslam.learning.arrays import write_arrays
 from fcslam.untrusted import read_arrays
 
@@ -62,5 +62,5 @@ def read_checkpoint(path: Path) -> Checkpoint:
             return Checkpoint(header["stage"], header["step"], header["settings"], tensors, header.get("examples", 0))
         found = header["format"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise TrainingError(f"{path}: is not a checkpoint of a training run ({error}); remove it") from error
-    raise TrainingError(f"{path}: has format {found}, expected {FORMAT}; start again in another folder")
+        raise InputError(f"{path}: is not a checkpoint of a training run ({error}); remove it") from error
+    raise InputError(f"{path}: has format {found}, expected {FORMAT}; start again in another folder")

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.features.detector import GreyImage
 from fcslam.learning.code_batches import RevisitExamples, draw_rehearsal, draw_revisits, draw_views
 from fcslam.learning.local_training import (
@@ -74,7 +74,7 @@ def train_codes(
     """
     settings, device = plan.settings, plan.device
     if not revisits:
-        raise TrainingError("codes are trained on places seen again, but no place was")
+        raise InputError("codes are trained on places seen again, but no place was")
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     before = before.to(device)
     known = inputs.of(network, revisits.images, settings.seed, device)

@@ -9,7 +9,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from fcslam.errors import FeatureError, TrainingError
+from fcslam.errors import FeatureError, InputError
 from fcslam.features.detector import GreyImage
 from fcslam.features.files import read_grey
 
@@ -38,14 +38,14 @@ def find_images(roots: Sequence[Path]) -> list[ImageFile]:
     found: dict[str, ImageFile] = {}
     for root in roots:
         if not root.is_dir():
-            raise TrainingError(f"{root}: is not a folder; give a folder of images")
+            raise InputError(f"{root}: is not a folder; give a folder of images")
         base = root.resolve()
         files = [file for file in base.rglob("*") if file.suffix.lower() in SUFFIXES and file.is_file()]
         if not files:
-            raise TrainingError(f"{root}: holds no image ({', '.join(sorted(SUFFIXES))}); give a folder of images")
+            raise InputError(f"{root}: holds no image ({', '.join(sorted(SUFFIXES))}); give a folder of images")
         images = {name: ImageFile(file, name) for file in files for name in [file.relative_to(base.parent).as_posix()]}
         if found.keys() & images.keys():
-            raise TrainingError(f"{root}: another folder has the same name and the same files; rename one of them")
+            raise InputError(f"{root}: another folder has the same name and the same files; rename one of them")
         found |= images
     return [found[name] for name in sorted(found)]
 

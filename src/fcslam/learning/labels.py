@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.arrays import write_arrays
 from fcslam.untrusted import read_arrays
 
@@ -73,11 +73,11 @@ def read_teacher(path: Path) -> Teacher:
         arrays = read_arrays(path)
         keypoints, scores, descriptors = (arrays[name] for name in ("keypoints", "scores", "descriptors"))
     except (OSError, ValueError, KeyError) as error:
-        raise TrainingError(f"{path}: is not a file of a teacher's points ({error})") from error
+        raise InputError(f"{path}: is not a file of a teacher's points ({error})") from error
     sides = (scores.ndim, keypoints.ndim, keypoints.shape[1:], descriptors.ndim) == (1, 2, (2,), 2)
     sound = sides and len(keypoints) == len(scores) == len(descriptors)
     if not sound or not all(is_finite(array) for array in (keypoints, scores, descriptors)):
-        raise TrainingError(f"{path}: keypoints (N, 2), scores (N,) and descriptors (N, D) do not fit together")
+        raise InputError(f"{path}: keypoints (N, 2), scores (N,) and descriptors (N, D) do not fit together")
     order = np.argsort(-scores.astype(np.float64), kind="stable")
     return Teacher(keypoints[order].astype(np.float32), descriptors[order].astype(np.float16))
 

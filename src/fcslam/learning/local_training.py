@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.batches import batch_stream
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import LOSSES
@@ -95,7 +95,7 @@ def _descended(network: KeypointNetwork, losses_of: LossesOf, plan: LocalTrainin
         try:
             restore_optimizer_state(optimizer, plan.optimizer_state)
         except (KeyError, ValueError) as error:
-            raise TrainingError(f"the optimizer cannot continue ({error})") from error
+            raise InputError(f"the optimizer cannot continue ({error})") from error
     sums: dict[str, float] = {}
     for done in range(1, plan.steps + 1):
         step = plan.first_step + done - 1
@@ -109,7 +109,7 @@ def _descended(network: KeypointNetwork, losses_of: LossesOf, plan: LocalTrainin
     state = get_optimizer_state(optimizer)
     if not all(bool(torch.isfinite(value).all()) for value in state.values()):
         # Checked here, because whatever continues from this state would diverge.
-        raise TrainingError("training diverged in the last step; lower the learning rate")
+        raise InputError("training diverged in the last step; lower the learning rate")
     return LocalTrainingResult(network, {name: total / plan.steps for name, total in sums.items()}, state)
 
 
@@ -125,6 +125,6 @@ def network_from_state(encoder: Encoder, state: Mapping[str, Tensor]) -> Keypoin
     try:
         network.load_state_dict(dict(state))
     except RuntimeError as error:
-        raise TrainingError(f"the weights are not those of a {encoder} network ({error})") from error
+        raise InputError(f"the weights are not those of a {encoder} network ({error})") from error
     network.eval()
     return network

@@ -15,7 +15,7 @@ from typing import Final, overload
 import numpy as np
 import torch
 
-from fcslam.errors import TrainingError, writing
+from fcslam.errors import InputError, writing
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
 from fcslam.learning.artifacts import Curve, Panel, TrainingReport
@@ -167,7 +167,7 @@ def read_labelled_images(
                 teacher_of_image = read_teacher(teacher / f"{file.name}.npz")
                 sizes.add(teacher_of_image.descriptors.shape[1])
                 if len(sizes) > 1:
-                    raise TrainingError(
+                    raise InputError(
                         f"{teacher / file.name}.npz: has descriptors of another size than the files before "
                         f"({' and '.join(map(str, sorted(sizes)))}); make all files with one teacher"
                     )
@@ -197,8 +197,8 @@ def _check_usable(files: Sequence[ImageFile]) -> None:
     raise _too_few(usable, len(files))
 
 
-def _too_few(usable: int, files: int) -> TrainingError:
-    return TrainingError(
+def _too_few(usable: int, files: int) -> InputError:
+    return InputError(
         f"only {usable} of {files} image files can be trained on: the others are not images, smaller than 96 px or "
         "have too few corners; give more images"
     )

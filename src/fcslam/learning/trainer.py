@@ -13,7 +13,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from fcslam.errors import TrainingError, writing
+from fcslam.errors import InputError, writing
 from fcslam.learning.artifacts import Curve
 from fcslam.learning.batches import batch_stream
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
@@ -159,13 +159,13 @@ class TrainingRun:
         checkpoint = read_checkpoint(path)
         fixed = self.settings.model_dump(mode="json") | {"steps": checkpoint.settings.get("steps")}
         if checkpoint.settings != fixed or checkpoint.stage != self.stage:
-            raise TrainingError(f"{path}: belongs to a run with other settings; give the same or another --output")
+            raise InputError(f"{path}: belongs to a run with other settings; give the same or another --output")
         if checkpoint.examples != self._examples:
-            raise TrainingError(
+            raise InputError(
                 f"{path}: was trained on other images, by another teacher or from another start; give another --output"
             )
         if checkpoint.step > self.settings.steps:
-            raise TrainingError(
+            raise InputError(
                 f"{path}: has {checkpoint.step} steps already, more than {self.settings.steps}; give another --output"
             )
         try:
@@ -173,7 +173,7 @@ class TrainingRun:
             self.average.load_state_dict(checkpoint.part(AVERAGE))
             restore_optimizer_state(self.optimizer, checkpoint.part(OPTIMIZER))
         except (KeyError, RuntimeError, ValueError) as error:
-            raise TrainingError(f"{path}: does not fit this network ({error})") from error
+            raise InputError(f"{path}: does not fit this network ({error})") from error
         self.step = checkpoint.step
 
     def _save(self) -> None:
@@ -203,5 +203,5 @@ def read_curves(path: Path, stage: str) -> dict[str, Curve]:
                 if row["stage"] == stage:
                     values.setdefault(row["name"], {})[int(row["step"])] = float(row["value"])
     except (OSError, KeyError, ValueError, TypeError) as error:
-        raise TrainingError(f"{path}: is not a log of a training run ({error})") from error
+        raise InputError(f"{path}: is not a log of a training run ({error})") from error
     return {name: (sorted(points), [points[step] for step in sorted(points)]) for name, points in values.items()}

@@ -6,7 +6,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.batches import TrainingBatch
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import LossWeights, TeacherBits, grid_shift, objective
@@ -83,7 +83,7 @@ def step_losses(
 def descend(network: KeypointNetwork, optimizer: torch.optim.Optimizer, total: Tensor, step: int, rate: float) -> None:
     """Follow the gradient of a step's sum of losses in place, with this learning rate."""
     if not torch.isfinite(total):
-        raise TrainingError(f"training diverged at step {step}; lower the learning rate")
+        raise InputError(f"training diverged at step {step}; lower the learning rate")
     for group in optimizer.param_groups:
         group["lr"] = rate
     optimizer.zero_grad(set_to_none=True)

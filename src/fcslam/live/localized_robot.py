@@ -167,7 +167,7 @@ class LocalizedRobot(LiveTracker):
             The run that was written.
 
         Raises:
-            OutputError: the folder cannot be written.
+            InputError: the folder cannot be written.
         """
         prepare_output(Path(folder), force)
         state = self._localizer.state

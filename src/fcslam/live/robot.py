@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from fcslam.api import settings_of
 from fcslam.cloud.sessions import session_name
-from fcslam.errors import InputError, PacketError, StateError
+from fcslam.errors import InputError, PacketError
 from fcslam.geometry import se2
 from fcslam.live.fleet_view import FleetView
 from fcslam.live.inputs import Lasers, checked_camera, checked_image, checked_stamp
@@ -338,7 +338,7 @@ class Robot(LiveTracker):
 
         Raises:
             CloudError: the server rejects the robot.
-            StateError: the state folder cannot be used.
+            InputError: the state folder cannot be used.
         """
         with self._lock:
             if not self._is_finished:
@@ -362,7 +362,7 @@ class Robot(LiveTracker):
 
         Raises:
             CloudError: the server rejects the robot.
-            StateError: the state folder cannot be used.
+            InputError: the state folder cannot be used.
         """
         self._raise_failure()
         with self._lock:
@@ -379,7 +379,7 @@ class Robot(LiveTracker):
 
         Raises:
             CloudError: the server rejects the robot.
-            StateError: the state folder cannot be used.
+            InputError: the state folder cannot be used.
         """
         self._raise_failure()
         while self._is_behind():
@@ -397,7 +397,7 @@ class Robot(LiveTracker):
             The run that was written.
 
         Raises:
-            OutputError: the folder cannot be written.
+            InputError: the folder cannot be written.
             InputError: the robot has no map of its own, or no scan was added.
             FcslamError: the worker has ended.
         """
@@ -596,7 +596,7 @@ def _state_folder(given: StrPath | None, is_needed: bool, stack: ExitStack) -> P
     """The state folder, made if it is not there; one that is removed with ``stack`` if none is given and needed.
 
     Raises:
-        StateError: it cannot be made.
+        InputError: it cannot be made.
     """
     if given is None:
         return Path(stack.enter_context(TemporaryDirectory(prefix="fcslam-"))) if is_needed else None
@@ -604,7 +604,7 @@ def _state_folder(given: StrPath | None, is_needed: bool, stack: ExitStack) -> P
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StateError(
+        raise InputError(
             f"{folder}: cannot be made ({error.strerror}); give another folder: --state, in Python state="
         ) from error
     return folder

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from fcslam.errors import CloudError, EvaluationError, SourceError, UnavailableError
+from fcslam.errors import CloudError, InputError, SourceError, UnavailableError
 from fcslam.maps.occupancy_map import area_of, map_stem, parse_map
 from fcslam.records import FloatArray, frozen
 from fcslam.runs import RobotTrajectory, Run, prepare_output
@@ -30,7 +30,7 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
     Raises:
         CloudError: the cloud rejects the robot, or it cannot be reached and there is no earlier copy.
         SourceError: the cloud has no map.
-        OutputError: ``folder`` is something else than a run folder, or cannot be written.
+        InputError: ``folder`` is something else than a run folder, or cannot be written.
     """
     prepare_output(folder, force=True)
     troubles = []
@@ -79,6 +79,6 @@ def _fits(served: ServedMap, files: dict[str, bytes], server: str) -> bool:
         if not np.allclose(area.extent_m, served.extent_m, rtol=0.0, atol=1e-6):
             return False
         parse_map(stem, image, description)
-    except EvaluationError as error:
+    except InputError as error:
         raise CloudError(f"{server}: {error}") from error
     return True

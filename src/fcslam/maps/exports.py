@@ -51,7 +51,7 @@ def export_map(folder: Path, number: int, suffix: str) -> bytes | None:
     None if there is no such map, or if a GeoTIFF is asked for and the map's place on the earth is unknown.
 
     Raises:
-        EvaluationError: the files of the map are broken.
+        InputError: the files of the map are broken.
     """
     stem = map_stem(number)
     try:

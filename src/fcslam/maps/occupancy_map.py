@@ -12,7 +12,7 @@ import yaml
 from numpy.typing import NDArray
 
 from fcslam.config import one_line, parse_yaml
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.records import frozen
 
 OCCUPIED_THRESHOLD: Final = 0.65
@@ -133,7 +133,7 @@ def parse_image(name: str, pgm: bytes, description: str) -> MapImage:
             raise ValueError(f"the image has {len(pgm) - begin} pixels, not {width} x {height}")
         resolution_m, origin_xy, occupied_threshold, free_threshold = _own_description(description)
     except ValueError as error:
-        raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
+        raise InputError(f"{name} is broken: {one_line(str(error))}") from error
     occupancy = (255 - np.arange(256)) / 255.0
     known = np.full(256, Occupancy.UNKNOWN, np.uint8)
     known[occupancy < free_threshold] = Occupancy.FREE
@@ -151,7 +151,7 @@ def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
         description: content of the YAML file; the image that it names is not opened.
 
     Raises:
-        EvaluationError: the image is not a binary PGM of its stated size, or the description is incomplete, contains a
+        InputError: the image is not a binary PGM of its stated size, or the description is incomplete, contains a
             number that is out of range, or rotates or negates the image.
     """
     image = parse_image(name, pgm, description)
@@ -168,7 +168,7 @@ def area_of(name: str, header: bytes, description: str) -> MapArea:
         width, height, _ = _size(header)
         resolution_m, (x, y), *_ = _own_description(description)
     except ValueError as error:
-        raise EvaluationError(f"{name} is broken: {one_line(str(error))}") from error
+        raise InputError(f"{name} is broken: {one_line(str(error))}") from error
     return MapArea(resolution_m, (x, y, x + width * resolution_m, y + height * resolution_m))
 
 

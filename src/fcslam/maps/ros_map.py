@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.config import one_line, parse_yaml
-from fcslam.errors import EvaluationError, SourceError
+from fcslam.errors import InputError, SourceError
 from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap, number_in, read_description
 from fcslam.records import frozen
 from fcslam.untrusted import MOST_TEXT_BYTES, check_image, read_bytes, read_text
@@ -43,13 +43,13 @@ def parse_ros_map(name: str, image: bytes, description: str) -> OccupancyMap:
         description: content of the YAML file; the image that it names is not opened.
 
     Raises:
-        EvaluationError: the image cannot be read, the description is incomplete or contains a number that is out of
+        InputError: the image cannot be read, the description is incomplete or contains a number that is out of
             range, or there are no walls or no floor by its thresholds.
     """
     try:
         return _map(image, description)
     except (OSError, ValueError, cv2.error) as error:
-        raise EvaluationError(f"{name}: not a map for ROS map_server: {one_line(str(error))}") from error
+        raise InputError(f"{name}: not a map for ROS map_server: {one_line(str(error))}") from error
 
 
 def read_ros_map(path: Path) -> OccupancyMap:
@@ -71,7 +71,7 @@ def read_ros_map(path: Path) -> OccupancyMap:
         ) from error
     except (KeyError, TypeError, ValueError) as error:
         raise SourceError(f"{path}: names no image; give a run folder or the YAML file of a map") from error
-    except EvaluationError as error:
+    except InputError as error:
         raise SourceError(str(error)) from error
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.records import FloatArray, frozen
 from fcslam.untrusted import open_unpacked
@@ -159,7 +159,7 @@ def relation_errors(relations: Relations, poses: PoseTable) -> RelationErrors:
     """Compute the errors of ``poses``; a relation is unusable if a stamp has no pose or its poses are in two maps."""
     row = poses.find(relations.stamps)
     if not np.any(row >= 0):
-        raise EvaluationError(
+        raise InputError(
             f"none of the {len(relations)} relations names a stamp of the run; are they of the same recording?"
         )
     usable = np.all(row >= 0, axis=1) & (poses.maps[row[:, 0]] == poses.maps[row[:, 1]])
@@ -180,9 +180,9 @@ def read_relations(path: Path) -> Relations:
         with open_unpacked(path, by_name=True) as file, io.TextIOWrapper(file, encoding="utf-8") as lines:
             rows = _parse(lines, path)
     except (OSError, EOFError, UnicodeDecodeError, zlib.error, lzma.LZMAError) as error:
-        raise EvaluationError(f"{path}: cannot read the relations ({error})") from error
+        raise InputError(f"{path}: cannot read the relations ({error})") from error
     if not rows:
-        raise EvaluationError(f"{path}: no relations in it; expected lines '{_COLUMNS}'")
+        raise InputError(f"{path}: no relations in it; expected lines '{_COLUMNS}'")
     table = np.array(rows)
     return Relations(frozen(table[:, :2]), frozen(table[:, [2, 3, 7]]))
 
@@ -198,11 +198,11 @@ def _parse(lines: Iterable[str], path: Path) -> list[list[float]]:
 
 def _numbers(fields: list[str], where: str) -> list[float]:
     if len(fields) != 8:
-        raise EvaluationError(f"{where}: expected 8 numbers '{_COLUMNS}', found {len(fields)} fields")
+        raise InputError(f"{where}: expected 8 numbers '{_COLUMNS}', found {len(fields)} fields")
     try:
         numbers = [float(field) for field in fields]
     except ValueError as error:
-        raise EvaluationError(f"{where}: {error}; expected '{_COLUMNS}'") from error
+        raise InputError(f"{where}: {error}; expected '{_COLUMNS}'") from error
     if not np.all(np.isfinite(numbers)):
-        raise EvaluationError(f"{where}: a number that is not finite")
+        raise InputError(f"{where}: a number that is not finite")
     return numbers

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 
-from fcslam.errors import ConfigError, PacketError
+from fcslam.errors import InputError, PacketError
 from fcslam.records import LaserScan, SensorRecord
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
@@ -52,16 +52,16 @@ def on_floors(sources: Sequence[Source], floors: Mapping[str, str]) -> list[Sour
     for key, floor in floors.items():
         name, at, time = key.partition("@")
         if name not in of:
-            raise ConfigError(f"a floor names '{name}', but the robots are {', '.join(of)}")
+            raise InputError(f"a floor names '{name}', but the robots are {', '.join(of)}")
         try:
             check_floor(floor)
         except PacketError as error:
-            raise ConfigError(str(error)) from error
+            raise InputError(str(error)) from error
         of[name][_seconds(key, time) if at else 0.0] = floor
     for source in sources:
         last_s = max(of[source.name], default=0.0)
         if last_s > 0.0 and last_s > (duration_s := source.survey().duration_s):
-            raise ConfigError(
+            raise InputError(
                 f"a floor begins {last_s:g} s after the first scan, but {source.name} has {duration_s:.1f} s"
             )
     return [OnFloors(source, of[source.name]) if of[source.name] else source for source in sources]
@@ -73,7 +73,7 @@ def _seconds(key: str, text: str) -> float:
     except ValueError:
         seconds = math.nan
     if not 0.0 < seconds < math.inf:
-        raise ConfigError(
+        raise InputError(
             f"a floor names '{key}'; expected NAME@TIME with seconds after the first scan, such as anna@44"
         )
     return seconds

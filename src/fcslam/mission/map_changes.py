@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fcslam.cloud.sessions import in_session
-from fcslam.errors import OutputError, SourceError
+from fcslam.errors import InputError, SourceError
 from fcslam.maps.changes import APPEARED, DISAPPEARED, Changes, compare
 from fcslam.maps.fusion import Period, fuse_periods, periods_of
 from fcslam.maps.occupancy_map import OccupancyMap, server_files
@@ -96,7 +96,7 @@ def save_changes(changes: Changes, folder: Path, force: bool = False) -> None:
             (place / PICTURE).write_bytes(changes.png())
             (place / TABLE).write_text(_table(changes), encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"{folder}: cannot write the changes ({error})") from error
+        raise InputError(f"{folder}: cannot write the changes ({error})") from error
 
 
 def check_output(folder: Path, force: bool = False) -> None:
@@ -104,9 +104,9 @@ def check_output(folder: Path, force: bool = False) -> None:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not (folder / TABLE).is_file():
-        raise OutputError(f"{folder}: exists and holds no changes; name a new folder")
+        raise InputError(f"{folder}: exists and holds no changes; name a new folder")
     if not force:
-        raise OutputError(f"{folder}: already holds changes; name a new folder or give --force to replace them")
+        raise InputError(f"{folder}: already holds changes; name a new folder or give --force to replace them")
 
 
 def _table(changes: Changes) -> str:

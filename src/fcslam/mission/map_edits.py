@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from fcslam.cloud.edits import check_polygon
-from fcslam.errors import EditError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
 from fcslam.mission.mission_file import SavedMission
@@ -20,7 +20,7 @@ def check_closure(run: Run, decision: Veto | Pin) -> None:
     named = Veto(decision.robot_i, decision.robot_j, decision.stamps)
     if not any(named.forbids(c.robot_i, c.stamp_i, c.robot_j, c.stamp_j) for c in run.closures):
         (at_i, at_j), (i, j) = decision.stamps, (decision.robot_i, decision.robot_j)
-        raise EditError(
+        raise InputError(
             f"there is no closure {i} {at_i:.6f} {j} {at_j:.6f}; copy both ends from a line of closures.csv"
         )
 
@@ -73,7 +73,7 @@ def motion_to_points(points: Sequence[tuple[float, float]], targets: Sequence[tu
     """
     T_new_map = n_point_alignment(np.array(targets).reshape(-1, 2), np.array(points).reshape(-1, 2))
     if not np.isfinite(T_new_map).all():
-        raise EditError("the points fix no rotation; give two or more that lie apart")
+        raise InputError("the points fix no rotation; give two or more that lie apart")
     return T_new_map
 
 
@@ -82,7 +82,7 @@ def _keyscans(run: Run, mission: SavedMission, map_index: int) -> Iterator[tuple
     sessions = [t for t in run.trajectories.values() if t.map_index == map_index]
     if not sessions:
         known = sorted({trajectory.map_index for trajectory in run.trajectories.values()})
-        raise EditError(f"there is no map {map_index}; there are {', '.join(map(str, known))}")
+        raise InputError(f"there is no map {map_index}; there are {', '.join(map(str, known))}")
     for trajectory in sessions:
         track = mission.tracks.get(trajectory.robot)
         every = np.ones(len(trajectory.stamps), bool)

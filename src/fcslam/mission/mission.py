@@ -21,7 +21,7 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.config import Settings, dump
-from fcslam.errors import ConfigError, FcslamError, PacketError, SourceError
+from fcslam.errors import FcslamError, InputError, PacketError, SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.driving import Drive, Leg, continued, one_by_one
@@ -285,4 +285,4 @@ def check_robots(sources: Sequence[Source]) -> None:
 def _check_known(what: str, names: Iterable[str], robots: Sequence[str]) -> None:
     for name in names:
         if robot_of(name) not in robots:
-            raise ConfigError(f"{what} names '{name}', but the robots are {', '.join(robots)}")
+            raise InputError(f"{what} names '{name}', but the robots are {', '.join(robots)}")

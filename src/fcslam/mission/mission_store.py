@@ -19,7 +19,7 @@ from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import robot_and_epoch, robot_of, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import one_line
-from fcslam.errors import EditError, PacketConflictError, StoreError
+from fcslam.errors import InputError, PacketConflictError, StoreError
 from fcslam.records import Change, Channel, Constraint, Correction, Edit, Keyscan, ManualClosure, Removal, Undo, frozen
 from fcslam.storage.database import Database, check_file, translate_errors
 from fcslam.storage.row_store import RowStore, StoreTable, Transaction
@@ -278,7 +278,7 @@ class MissionStore:
         """Append an edit to the log.
 
         Raises:
-            EditError: it undoes what cannot be undone.
+            InputError: it undoes what cannot be undone.
         """
         with self._database.transaction() as database:
             if isinstance(content, Undo):
@@ -291,7 +291,7 @@ class MissionStore:
         """Check that the sessions and moments that an edit names are in the mission, both of a closure on one floor.
 
         Raises:
-            EditError: they are not.
+            InputError: they are not.
         """
         spans = {
             session_name(robot, epoch): (first, last)
@@ -307,15 +307,15 @@ class MissionStore:
                 named = (session_name(content.robot, epoch),)
         for name in named:
             if name not in known:
-                raise EditError(f"there is no session '{name}'; there are {', '.join(sorted(known))}")
+                raise InputError(f"there is no session '{name}'; there are {', '.join(sorted(known))}")
         for name, stamp in stamps_of(content):
             first, last = spans[name]
             if not first - NEARBY_S <= stamp <= last + NEARBY_S:
-                raise EditError(f"{name} has no scan at {stamp:.3f} s; its scans are from {first:.3f} to {last:.3f} s")
+                raise InputError(f"{name} has no scan at {stamp:.3f} s; its scans are from {first:.3f} to {last:.3f} s")
         if isinstance(content, ManualClosure):
             given = floors(in_force(self.edits()))
             if len({given.get(name, self._floor(name)) for name in named}) > 1:
-                raise EditError(f"{' and '.join(named)} are on different floors, which no closure joins")
+                raise InputError(f"{' and '.join(named)} are on different floors, which no closure joins")
 
     def _floor(self, session: str) -> str:
         """Floor that a session names; empty if none."""
@@ -463,7 +463,7 @@ def check_mission(path: Path) -> None:
                 Label("", PacketKind(kind), None if channel is None else Channel(channel))
         CloudConfig.model_validate_json(facts.get(CONFIG, "{}"))
         int(facts.get(APPLIED, "0"))
-    except (ValueError, EditError) as error:
+    except (ValueError, InputError) as error:
         raise StoreError(f"{path}: {one_line(str(error))}") from error
 
 
@@ -477,7 +477,7 @@ def _check_edits(rows: Sequence[tuple[int, str, float, str, str]]) -> None:
     for number, author, time_s, kind, content in rows:
         edit = Edit(number, author, time_s, read_edit(kind, content))
         if number != len(edits) + 1:
-            raise EditError(f"edit {len(edits) + 1} is missing")
+            raise InputError(f"edit {len(edits) + 1} is missing")
         if isinstance(edit.content, Undo):
             check_undo(edits, edit.content.number)
         edits.append(edit)

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import quote, unquote
 
 from fcslam.config import StrictModel
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.maps.exports import export_map
 from fcslam.maps.occupancy_map import OccupancyMap, map_stem
 from fcslam.maps.tiles import WORLD_M, finest_zoom, tile_png
@@ -53,7 +53,7 @@ def report_html(mission: ViewedMission) -> str:
         pictures = _pictures(mission, maps, zooms)
         return _page({"texts": _texts(mission, zooms), "pictures": pictures, "files": _files(mission, maps)})
     except (OSError, ValueError) as error:
-        raise EvaluationError(f"the run has files that cannot be shown ({error})") from error
+        raise InputError(f"the run has files that cannot be shown ({error})") from error
 
 
 def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
@@ -76,7 +76,7 @@ def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
                 run_of(mission), status, MOST_CLOSURES
             ).decode()
         except ValueError as error:
-            raise EvaluationError(f"the run has closures that cannot be shown ({error})") from error
+            raise InputError(f"the run has closures that cannot be shown ({error})") from error
     if mission.run_folder is not None:
         texts |= {f"maps/{k}/walls": _json(walls_of(mission.run_folder, k)) for k in zooms}
         located = (quote(one.session, safe="") for one in sessions if one.T_map_base)

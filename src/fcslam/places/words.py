@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.errors import InputError, OutputError, writing
+from fcslam.errors import InputError, writing
 from fcslam.features.codes import code_words, nearest_codes
 from fcslam.places.kmeans_tree import TreeShape, k_means
 from fcslam.records import CODE_BYTES, NAME, PLACE_CHANNELS, Channel, Codes, frozen
@@ -97,7 +97,7 @@ def _check_replaceable(path: Path) -> None:
     try:
         read_vocabularies(path)
     except InputError as error:
-        raise OutputError(f"{path}: exists and is not a vocabulary, so it stays; choose another name") from error
+        raise InputError(f"{path}: exists and is not a vocabulary, so it stays; choose another name") from error
 
 
 def read_vocabularies(path: Path) -> tuple[WordVocabulary, ...]:

@@ -120,7 +120,7 @@ class RobotBackend:
             keyframes: folder that keeps the keyframes, for a process that learns from them; None: they are not kept.
 
         Raises:
-            StateError: the folder cannot be written.
+            InputError: the folder cannot be written.
             FeatureError: the detector is a network whose weights cannot be used, or there are no words for it.
             InputError: the file of the vocabulary cannot be read.
         """

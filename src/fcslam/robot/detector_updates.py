@@ -7,7 +7,7 @@ import queue
 from concurrent.futures import Future
 from pathlib import Path
 
-from fcslam.errors import StateError
+from fcslam.errors import InputError
 from fcslam.records import DetectorFile
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.outbox import Outbox
@@ -48,7 +48,7 @@ class DetectorUpdates:
             self._folder.mkdir(parents=True, exist_ok=True)
             write_file(self._path(file), content)  # a resumed recording may need the old one
         except OSError as error:
-            raise StateError(
+            raise InputError(
                 f"{self._folder}: cannot store detector {file.version} ({error}); free some space, then use --resume"
             ) from error
         self._fetched.put(file)

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from fcslam.errors import InputError, StateError
+from fcslam.errors import InputError
 from fcslam.features.detector import ImageFeatures
 from fcslam.features.lidar_depth import LidarView
 from fcslam.geometry import se2
@@ -51,7 +51,7 @@ class KeyframeFolder:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise StateError(f"{folder}: cannot keep keyframes ({error}); give another --state") from error
+            raise InputError(f"{folder}: cannot keep keyframes ({error}); give another --state") from error
 
     def keep(self, image: KeyframeImage, features: ImageFeatures, detector_version: str) -> None:
         """Write a keyframe, or the one of this keyscan again with a newer detector."""

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fcslam.errors import PacketError, StateError, StoreError
+from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.records import Channel, DetectorFile, Place, WordPlace
 from fcslam.storage.database import Database
 from fcslam.wire.batches import LENGTH
@@ -90,7 +90,7 @@ class Outbox:
                 self.waiting = WaitingPackets(*_count(connection, _IS_WAITING))
                 """Packets that are not confirmed yet, of all sessions."""
             self._check_waiting()
-        except StateError:
+        except InputError:
             self.close()
             raise
 
@@ -102,7 +102,7 @@ class Outbox:
         )
         for epoch, session, ordinal, sequence, digest, data in self._rows(question):
             if not _is_whole(data, session, ordinal, digest):
-                raise StateError(
+                raise InputError(
                     f"{self._path}: packet {sequence} of epoch {epoch} is damaged, and later packets depend on "
                     "it; give another --state"
                 )
@@ -122,13 +122,13 @@ class Outbox:
             Number of packets that the front end will produce again; 0 if nothing is resumed.
 
         Raises:
-            StateError: the last start read another recording.
+            InputError: the last start read another recording.
         """
         with self._transaction() as connection:
             last, before = _one(connection, "SELECT max(epoch), recording FROM sessions WHERE session = 0")
             if resume and last is not None:
                 if before != recording:
-                    raise StateError(
+                    raise InputError(
                         f"{self._path}: left by another recording, other settings or another version; "
                         "leave --resume out to start anew"
                     )
@@ -237,7 +237,7 @@ class Outbox:
             whose first packets it had confirmed and does not have any more.
 
         Raises:
-            StateError: the cloud does not have the first packets of the present epoch any more, or no epoch is left.
+            InputError: the cloud does not have the first packets of the present epoch any more, or no epoch is left.
         """
         with self._transaction() as connection:
             newest = max(expected, default=-1)
@@ -246,7 +246,7 @@ class Outbox:
                 newest = max(epoch, newest + 1)
                 moves.append((epoch, newest))
             if newest > MAXIMUM_EPOCH:
-                raise StateError(
+                raise InputError(
                     f"{self._path}: the cloud has packets of epoch {max(expected)} of this robot, and epochs end at "
                     f"{MAXIMUM_EPOCH}: something else sends under its name; replace its token and start a new mission"
                 )
@@ -257,7 +257,7 @@ class Outbox:
             broken = {epoch: stored for epoch, stored in sessions if expected.get(epoch, 0) < stored}
             if self.epoch in broken:
                 had, has = broken[self.epoch], expected.get(self.epoch, 0)
-                raise StateError(
+                raise InputError(
                     f"{self._path}: the cloud has {has} of {had} packets of epoch {self.epoch} that were confirmed, so "
                     "its mission is another one; start anew: without --resume, or with another --state"
                 )
@@ -314,7 +314,7 @@ class Outbox:
                 row = robot, secrets.token_hex(16)
                 connection.execute("INSERT INTO robot VALUES (?, ?)", row)
         if row[0] != robot:
-            raise StateError(f"{self._path}: belongs to robot '{row[0]}', not '{robot}'; give each its own --state")
+            raise InputError(f"{self._path}: belongs to robot '{row[0]}', not '{robot}'; give each its own --state")
         return str(row[1])
 
     def _open_session(self, connection: sqlite3.Connection, session: int, recording: str) -> int:
@@ -333,7 +333,7 @@ class Outbox:
     def _is_known(self, connection: sqlite3.Connection, epoch: int, ordinal: int, digest: bytes) -> bool:
         row = _one(connection, "SELECT digest FROM packets WHERE epoch = ? AND ordinal = ?", epoch, ordinal)
         if row is not None and row[0] != digest:
-            raise StateError(
+            raise InputError(
                 f"{self._path}: packet {ordinal} differs from that of the interrupted run; leave --resume out"
             )
         return row is not None
@@ -349,15 +349,15 @@ class Outbox:
 
     @contextmanager
     def _state_errors(self) -> Iterator[None]:
-        """Raise errors of the database as a ``StateError`` of one line."""
+        """Raise errors of the database as an ``InputError`` of one line."""
         try:
             yield
         except StoreError as error:
             if error.__cause__ is None:
-                raise StateError(f"{self._path}: comes from another version of fcslam; give another --state") from error
+                raise InputError(f"{self._path}: comes from another version of fcslam; give another --state") from error
             reason = " ".join(str(error.__cause__).split())
             reason = "another process runs on it" if reason == "database is locked" else reason
-            raise StateError(f"{self._path}: cannot be used: {reason}; give another --state") from error
+            raise InputError(f"{self._path}: cannot be used: {reason}; give another --state") from error
 
 
 def _digest(data: bytes) -> bytes:

@@ -93,7 +93,7 @@ class Sender:
 
         Raises:
             CloudError: the cloud rejects the robot.
-            StateError: the outbox or its folder cannot be used, or the cloud lacks the beginning of this epoch.
+            InputError: the outbox or its folder cannot be used, or the cloud lacks the beginning of this epoch.
         """
         try:
             return self._step()

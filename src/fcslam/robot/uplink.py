@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fcslam.errors import StateError
+from fcslam.errors import InputError
 from fcslam.records import Correction
 from fcslam.robot.budget import Budget
 from fcslam.robot.detector_updates import DetectorUpdates
@@ -203,7 +203,7 @@ class Uplink:
             (self._refused / f"{stem}.bin").write_bytes(data)
             (self._refused / f"{stem}.txt").write_text(reason + "\n", encoding="utf-8")
         except OSError as error:
-            raise StateError(
+            raise InputError(
                 f"{self._refused}: cannot store a refused packet ({error}); free some space, then use --resume"
             ) from error
         self._refused_files += 1

@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from fcslam.errors import NetworkError
+from fcslam.errors import InputError
 from fcslam.ros.network import RosNetwork
 
 _ADDRESS = re.compile(r"(ros2|zenoh):(.*)", re.ASCII)
@@ -38,9 +38,7 @@ def parse_address(text: str) -> RosAddress:
     assert match is not None  # as is_address says
     namespace = match[2].rstrip("/")
     if not _NAMESPACE.fullmatch(namespace):
-        raise NetworkError(
-            f"{text}: {match[2]!r} is not a namespace; give one as in {match[1]}:/robot1, or {match[1]}:/"
-        )
+        raise InputError(f"{text}: {match[2]!r} is not a namespace; give one as in {match[1]}:/robot1, or {match[1]}:/")
     return RosAddress(match[1], namespace)
 
 
@@ -48,7 +46,7 @@ def open_network(address: RosAddress, environment: Mapping[str, str] = os.enviro
     """Join the network of ``address``; the domain of ROS 2 is ROS_DOMAIN_ID, or 0."""
     text = environment.get("ROS_DOMAIN_ID") or "0"
     if not text.isdecimal() or int(text) > _LARGEST_DOMAIN:
-        raise NetworkError(f"{text!r} is not a ROS 2 domain; give a number from 0 to {_LARGEST_DOMAIN}")
+        raise InputError(f"{text!r} is not a ROS 2 domain; give a number from 0 to {_LARGEST_DOMAIN}")
     if address.network == "zenoh":
         from fcslam.ros.ros2_zenoh import ZenohNetwork
 

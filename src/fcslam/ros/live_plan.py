@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
-from fcslam.errors import NetworkError
+from fcslam.errors import InputError
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.camera import Calibration
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage, StampedTransform
@@ -94,7 +94,7 @@ class LivePlanner:
         """The plan if enough is known; None to wait for more.
 
         Raises:
-            NetworkError: the lasers are not level, or tf cannot tell two apart.
+            InputError: the lasers are not level, or tf cannot tell two apart.
         """
         self._began = now_s if self._began is None else self._began
         is_late = now_s > self._began + PATIENCE_S
@@ -168,7 +168,7 @@ class LivePlanner:
         try:
             return mountings_of(sensors, self.tree, base_frame, self._options.laser_poses)
         except MountingError as error:
-            raise NetworkError(str(error)) from error
+            raise InputError(str(error)) from error
 
 
 def missing_mounting(error: NoTransformError) -> str:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fcslam.config import one_line
-from fcslam.errors import FcslamError, NetworkError
+from fcslam.errors import FcslamError, InputError
 from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
 from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock
@@ -64,7 +64,7 @@ def await_sensors(
     Odometry may also come from tf, which is there early on most robots. So its topic is given more time to appear.
 
     Raises:
-        NetworkError: a topic is missing, or of another type.
+        InputError: a topic is missing, or of another type.
     """
     end_s = time.monotonic() + timeout_s
     while True:
@@ -73,7 +73,7 @@ def await_sensors(
                 time.sleep(_SETTLES_FOR_ODOMETRY * settle_s)
             time.sleep(settle_s)
             return choose_sensor_topics(network.endpoints(), namespace, options)
-        except NetworkError:
+        except InputError:
             if time.monotonic() > end_s:
                 raise
             time.sleep(_POLL_S)
@@ -100,7 +100,7 @@ class RobotNode:
         it maps.
 
         Raises:
-            NetworkError: another node publishes what this one would.
+            InputError: another node publishes what this one would.
         """
         self._network, self._namespace, self._topics = network, namespace, topics
         self._map_topic = resolved(namespace, MAP)
@@ -120,7 +120,7 @@ class RobotNode:
         """Whether the robot knows its pose in the map, and since which stamp."""
         self._clock = RosClock(parameters.use_sim_time)
         if self._has_namesake(network.endpoints()):
-            raise NetworkError(
+            raise InputError(
                 f"another node publishes {self._map_topic}: a second robot of this name, or a map_server; stop it, or "
                 "give each robot a namespace of its own"
             )

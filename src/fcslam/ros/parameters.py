@@ -6,7 +6,7 @@ from typing import Any
 from pydantic import Field
 
 from fcslam.config import Settings, one_line, parse, parse_yaml
-from fcslam.errors import ConfigError
+from fcslam.errors import InputError
 from fcslam.untrusted import MOST_TEXT_BYTES, read_text
 
 _PARAMETERS = "ros__parameters"
@@ -32,19 +32,19 @@ def load_parameters(path: Path | None) -> NodeParameters:
     """The parameters in a file of ROS 2 (``NODE: ros__parameters: ...``), or a plain mapping; None: the default ones.
 
     Raises:
-        ConfigError: the file cannot be read, or a parameter is unknown or out of range.
+        InputError: the file cannot be read, or a parameter is unknown or out of range.
     """
     if path is None:
         return NodeParameters()
     try:
         content: Any = parse_yaml(read_text(path, most=MOST_TEXT_BYTES))
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: cannot be read ({one_line(str(error))})") from error
+        raise InputError(f"{path}: cannot be read ({one_line(str(error))})") from error
     if not isinstance(content, dict):
-        raise ConfigError(f"{path}: has no parameters; write `fcslam: {{ros__parameters: {{...}}}}`")
+        raise InputError(f"{path}: has no parameters; write `fcslam: {{ros__parameters: {{...}}}}`")
     nodes = [node[_PARAMETERS] for node in content.values() if isinstance(node, dict) and _PARAMETERS in node]
     if len(nodes) > 1:
-        raise ConfigError(
+        raise InputError(
             f"{path}: has parameters of {len(nodes)} nodes; give a file with the parameters of fcslam only"
         )
     return parse(NodeParameters, nodes[0] if nodes else content, str(path))

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from fcslam.errors import OutputError
+from fcslam.errors import InputError
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC
 from fcslam.ros.inbox import Inbox, ReceivedMessage
 from fcslam.ros.live_plan import Notify
@@ -33,7 +33,7 @@ def record(
     The file moves to ``output`` at the end. If it cannot be written to the end, what the disk took is kept beside it.
 
     Raises:
-        OutputError: the file cannot be written; the message names the file that is kept.
+        InputError: the file cannot be written; the message names the file that is kept.
     """
     inbox = Inbox()
     kinds = {**topics.kinds, CLOCK_TOPIC: CLOCK}
@@ -59,7 +59,7 @@ def record(
             recording.file.replace(output)
     except OSError as error:
         advice = "; ".join(filter(None, (kept, "free some space, or choose another path")))
-        raise OutputError(f"{output}: cannot be written ({error}); {advice}") from error
+        raise InputError(f"{output}: cannot be written ({error}); {advice}") from error
     for topic in (*topics.scans, *filter(None, (topics.odometry,))):
         if not counts[topic]:
             notify(f"{topic}: no message arrived")

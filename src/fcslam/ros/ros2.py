@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
-from fcslam.errors import NetworkError
+from fcslam.errors import InputError
 from fcslam.ros.network import TRIGGER, Act, Answer, Deliver, Endpoint, Publish, Quality
 from fcslam.sources.bags.codec import TRIGGER_RESPONSE, MessageCodec
 
@@ -48,12 +48,12 @@ class Ros2Network:
             from cyclonedds import builtin, core
             from cyclonedds import domain as domains
         except ImportError as error:
-            raise NetworkError(f"ROS 2 needs cyclonedds ({error}); install it: {INSTALL}") from error
+            raise InputError(f"ROS 2 needs cyclonedds ({error}); install it: {INSTALL}") from error
         try:
             self._domain = domains.Domain(domain, configuration(environment))
             self._participant = domains.DomainParticipant(domain)
         except core.DDSException as error:
-            raise NetworkError(
+            raise InputError(
                 f"DDS domain {domain} cannot be joined ({error}); check the network and CYCLONEDDS_URI"
             ) from error
         self._alive = core.InstanceState.Alive
@@ -204,7 +204,7 @@ def configuration(environment: Mapping[str, str]) -> str:
     peers = [peer for peer in environment.get("ROS_STATIC_PEERS", "").split(";") if peer]
     for peer in peers:
         if not _PEER.fullmatch(peer):
-            raise NetworkError(
+            raise InputError(
                 f"ROS_STATIC_PEERS has {peer!r}, which is not an address; separate addresses by semicolons"
             )
     # A node that is limited to this computer sends from the loopback interface, and Cyclone hears its own interfaces

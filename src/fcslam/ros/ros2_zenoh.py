@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any, Final
 
-from fcslam.errors import NetworkError
+from fcslam.errors import InputError
 from fcslam.ros.network import TRIGGER, Act, Answer, Deliver, Endpoint, Publish, Quality
 from fcslam.ros.ros2 import dds_type, kind_of
 from fcslam.sources.bags.codec import TRIGGER_RESPONSE, MessageCodec, full_name
@@ -50,16 +50,16 @@ class ZenohNetwork:
         try:
             import zenoh
         except ImportError as error:
-            raise NetworkError(f"Zenoh needs eclipse-zenoh ({error}); install it: {INSTALL}") from error
+            raise InputError(f"Zenoh needs eclipse-zenoh ({error}); install it: {INSTALL}") from error
         zenoh.init_log_from_env_or("off")
         config = session_config(environment)
         try:
             session = zenoh.open(config)
         except zenoh.ZError as error:
-            raise NetworkError(f"no session of Zenoh can be opened ({_first_line(error)}); {_ADVICE}") from error
+            raise InputError(f"no session of Zenoh can be opened ({_first_line(error)}); {_ADVICE}") from error
         if not list(session.info.routers_zid()) and not list(session.info.peers_zid()):
             session.close()
-            raise NetworkError(f"no Zenoh router answers at {config.get_json('connect/endpoints')}; {_ADVICE}")
+            raise InputError(f"no Zenoh router answers at {config.get_json('connect/endpoints')}; {_ADVICE}")
         self._zenoh, self._session, self._domain = zenoh, session, domain
         self._own = str(session.zid())
         self._codec = MessageCodec(ros1=False)
@@ -207,18 +207,18 @@ def session_config(environment: Mapping[str, str]) -> Any:
     try:
         config = zenoh.Config.from_file(path) if path else zenoh.Config()
     except zenoh.ZError as error:
-        raise NetworkError(f"ZENOH_SESSION_CONFIG_URI: {path} cannot be used ({_first_line(error)})") from error
+        raise InputError(f"ZENOH_SESSION_CONFIG_URI: {path} cannot be used ({_first_line(error)})") from error
     changes = [] if path else list(_SETTINGS.items())
     for change in filter(None, environment.get("ZENOH_CONFIG_OVERRIDE", "").split(";")):
         key, equals, value = change.partition("=")
         if not equals:
-            raise NetworkError(f"ZENOH_CONFIG_OVERRIDE has {change!r}; write KEY=VALUE, separated by semicolons")
+            raise InputError(f"ZENOH_CONFIG_OVERRIDE has {change!r}; write KEY=VALUE, separated by semicolons")
         changes.append((key.strip(), value))
     for key, value in changes:
         try:
             config.insert_json5(key, value)
         except zenoh.ZError as error:
-            raise NetworkError(f"ZENOH_CONFIG_OVERRIDE: {key}={value} cannot be used ({_first_line(error)})") from error
+            raise InputError(f"ZENOH_CONFIG_OVERRIDE: {key}={value} cannot be used ({_first_line(error)})") from error
     return config
 
 

@@ -116,7 +116,7 @@ class LiveSensors:
         ``received_ns`` is the time of a message without a stamp.
 
         Raises:
-            NetworkError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
+            InputError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
         """
         self._counts[topic] += 1
         if topic == self._topics.fixes:

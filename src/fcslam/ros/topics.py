@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from fcslam.errors import NetworkError, SourceError
+from fcslam.errors import InputError, SourceError
 from fcslam.ros.network import Endpoint, published
 from fcslam.sources.bags.codec import FIX, IMAGE, ODOMETRY, TRANSFORMS
 from fcslam.sources.bags.container import Topic
@@ -44,7 +44,7 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
     if there is one, else that of all robots.
 
     Raises:
-        NetworkError: a required topic is missing, or a named topic is missing or of another type; the message lists the
+        InputError: a required topic is missing, or a named topic is missing or of another type; the message lists the
             topics that are there.
     """
     known = published(endpoints)
@@ -69,7 +69,7 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
             has_images=lambda _: True,
         )
     except SourceError as error:
-        raise NetworkError(str(error)) from error
+        raise InputError(str(error)) from error
     odometry = next((topic for topic in chosen.odometry if topic.type == ODOMETRY), None)
     transforms = list(dict.fromkeys((*(topic for topic in chosen.odometry if topic != odometry), *transforms)))
     depth_infos = [calibration_beside(topic, every) for topic in chosen.scans if topic.type == IMAGE]

@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from fcslam.errors import EvaluationError, OutputError
+from fcslam.errors import InputError
 from fcslam.maps.occupancy_map import OccupancyMap, parse_map
 from fcslam.records import StrPath
 from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, LocalMap, Metric, RobotTrajectory
@@ -96,7 +96,7 @@ class Run:
         """The occupancy maps, by index; most robots are in map 0. Decoded at the first use.
 
         Raises:
-            EvaluationError: a map file is broken or has no description.
+            InputError: a map file is broken or has no description.
         """
         decoded = {}
         for name, pgm in self.map_files.items():
@@ -113,7 +113,7 @@ class Run:
             force: replace a run that is there.
 
         Raises:
-            OutputError: something else is there, a run is there and ``force`` is not given, a robot's name cannot be a
+            InputError: something else is there, a run is there and ``force`` is not given, a robot's name cannot be a
                 file name, or writing fails.
         """
         check_names([*self.trajectories, *self.local_maps, *self.map_files])
@@ -122,14 +122,14 @@ class Run:
             with replacing_folder(place) as staging:
                 _write(self, staging)
         except OSError as error:
-            raise OutputError(f"{place}: cannot write the run ({error})") from error
+            raise InputError(f"{place}: cannot write the run ({error})") from error
 
 
 def prepare_output(path: Path, force: bool = False) -> Path:
     """Check, before the long work, that a run folder can be put at ``path``; its parents are made.
 
     Raises:
-        OutputError: something else is there, a run is there and ``force`` is not given, or it cannot be written.
+        InputError: something else is there, a run is there and ``force`` is not given, or it cannot be written.
     """
     place = path.resolve()
     try:
@@ -137,15 +137,15 @@ def prepare_output(path: Path, force: bool = False) -> Path:
         bring_back(place)
         occupied = place.exists() and (not place.is_dir() or any(place.iterdir()))
     except OSError as error:
-        raise OutputError(f"{path}: cannot be used as the output folder ({error})") from error
+        raise InputError(f"{path}: cannot be used as the output folder ({error})") from error
     if not os.access(place.parent, os.W_OK):
-        raise OutputError(f"{path}: no permission to write in {place.parent}")
+        raise InputError(f"{path}: no permission to write in {place.parent}")
     if place == Path.cwd() or os.path.ismount(place):
-        raise OutputError(f"{path}: cannot be replaced as a whole; name a new folder inside it")
+        raise InputError(f"{path}: cannot be replaced as a whole; name a new folder inside it")
     if occupied and not (place.is_dir() and is_run_folder(place)):
-        raise OutputError(f"{path}: exists and is not a run folder; name a new folder")
+        raise InputError(f"{path}: exists and is not a run folder; name a new folder")
     if occupied and not force:
-        raise OutputError(
+        raise InputError(
             f"{path}: already holds a run; name a new folder or give --force (in Python force=True) to replace it"
         )
     return place
@@ -155,11 +155,11 @@ def check_names(names: Iterable[str]) -> None:
     """Check, before the long work, that robots' names can be file names.
 
     Raises:
-        OutputError: one cannot.
+        InputError: one cannot.
     """
     for name in names:
         if not _SAFE_NAME.fullmatch(name):
-            raise OutputError(f"{name!r} cannot be a file name; use letters, digits, '_', '-', '+' and '.'")
+            raise InputError(f"{name!r} cannot be a file name; use letters, digits, '_', '-', '+' and '.'")
 
 
 def is_run_folder(path: Path) -> bool:
@@ -185,13 +185,11 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
         maps: read the maps, the pose graph and the mission file too, which may be large.
 
     Raises:
-        EvaluationError: ``folder`` is not a run folder, or a file of it is missing or broken.
+        InputError: ``folder`` is not a run folder, or a file of it is missing or broken.
     """
     path = Path(folder)
     if not is_run_folder(path):
-        raise EvaluationError(
-            f"{path}: not a run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one"
-        )
+        raise InputError(f"{path}: not a run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one")
     try:
         robots = read_robots(path / ROBOTS, path)
         pictures, certificates = (*path.glob("map*.*"), *path.glob("plan.*")), path.glob(f"{QUALITY}*.*")
@@ -210,7 +208,7 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
             localized={file.stem: read_localized(file, path) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
         )
     except (OSError, ValueError, csv.Error) as error:
-        raise EvaluationError(f"{path}: a damaged run folder ({error})") from error
+        raise InputError(f"{path}: a damaged run folder ({error})") from error
 
 
 def _write(run: Run, folder: Path) -> None:

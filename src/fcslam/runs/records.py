@@ -76,7 +76,7 @@ class LocalMap:
         """The robot's own occupancy map.
 
         Raises:
-            EvaluationError: ``pgm`` or ``yaml`` is broken.
+            InputError: ``pgm`` or ``yaml`` is broken.
         """
         return parse_map(f"the own map of {self.robot}", self.pgm, self.yaml)
 

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.records import FLOOR, Channel, ClosureStatus, FloatArray, Reason, ReasonCode, frozen
 from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, Metric, RobotTrajectory
 from fcslam.untrusted import read_text
@@ -49,9 +49,9 @@ def read_tum(path: Path, within: Path | None = None) -> tuple[FloatArray, FloatA
         rows = [_tum_fields(line) for line in read_text(path, within).splitlines() if line.strip()]
         table = np.array(rows, dtype=np.float64).reshape(-1, 8)
     except (OSError, ValueError) as error:
-        raise EvaluationError(f"{path}: not a TUM trajectory ({error})") from error
+        raise InputError(f"{path}: not a TUM trajectory ({error})") from error
     if not np.all(np.isfinite(table)):
-        raise EvaluationError(f"{path}: not a TUM trajectory (a number that is not finite)")
+        raise InputError(f"{path}: not a TUM trajectory (a number that is not finite)")
     theta = 2.0 * np.arctan2(table[:, 6], table[:, 7])
     poses = np.column_stack((table[:, 1], table[:, 2], np.arctan2(np.sin(theta), np.cos(theta))))
     return frozen(table[:, 0]), frozen(poses)

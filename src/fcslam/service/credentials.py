@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from fcslam.errors import OutputError
+from fcslam.errors import InputError
 from fcslam.service.http.authentication import Role, TokenEntry, TokensFile, read_tokens
 from fcslam.storage.files import write_file
 from fcslam.wire.keys import AUTHORITY, CERTIFICATE, TOKEN
@@ -66,7 +66,7 @@ def make_credentials(folder: Path, hosts: Sequence[str], names: Mapping[str, Rol
                 _make_leaf(own / Path(CERTIFICATE).stem, name, [ExtendedKeyUsageOID.CLIENT_AUTH], (), authority, now)
         _add_tokens(folder, names)
     except (OSError, ValueError) as error:
-        raise OutputError(f"{folder}: cannot write credentials ({error}); name a new folder") from error
+        raise InputError(f"{folder}: cannot write credentials ({error}); name a new folder") from error
 
 
 def folder_of(folder: Path, name: str, role: Role) -> Path:
@@ -85,7 +85,7 @@ def make_cluster_credentials(folder: Path, now: datetime.datetime) -> None:
         purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         _make_leaf(cluster / "member", "fcslam cluster", purposes, (), _authority(cluster, now), now)
     except (OSError, ValueError) as error:
-        raise OutputError(f"{cluster}: cannot write credentials ({error}); name a new folder") from error
+        raise InputError(f"{cluster}: cannot write credentials ({error}); name a new folder") from error
 
 
 def _authority(folder: Path, now: datetime.datetime) -> Authority:
@@ -159,7 +159,7 @@ def _add_tokens(folder: Path, names: Mapping[str, Role]) -> None:
             token = secrets.token_urlsafe(TOKEN_BYTES)
             place = folder_of(folder, name, role) / TOKEN
             if place.exists():
-                raise OutputError(f"{place}: tokens.yaml has no entry for this token; remove it, and a new one is made")
+                raise InputError(f"{place}: tokens.yaml has no entry for this token; remove it, and a new one is made")
             write_file(place, f"{token}\n", private=True)
             entries.append(TokenEntry(name=name, role=role, sha256=hashlib.sha256(token.encode()).hexdigest()))
     if len(entries) == len(known):

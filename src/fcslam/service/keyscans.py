@@ -6,7 +6,7 @@ It follows the packets that arrived, without waiting for the next map.
 import numpy as np
 
 from fcslam.cloud.sessions import robot_and_epoch
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lidar.scan import keyscan_points
 from fcslam.lidar.submap import SPACING_M
@@ -55,7 +55,7 @@ def overlay_png(store: MissionStore, run: Run, closure: ClosureRow) -> bytes:
     """Draw the submaps at both ends of a closure as its measurement places them.
 
     Raises:
-        EvaluationError: the mission holds no keyscans of an end.
+        InputError: the mission holds no keyscans of an end.
     """
     i = _submap(store, run, closure.robot_i, closure.stamp_i)
     j = se2.transform(closure.T_i_j, _submap(store, run, closure.robot_j, closure.stamp_j))
@@ -71,7 +71,7 @@ def _submap(store: MissionStore, run: Run, session: str, stamp: float) -> FloatA
     robot, epoch = robot_and_epoch(session)
     hello, trajectory = store.newest_hello(robot, epoch), run.trajectories.get(session)
     if hello is None or trajectory is None:
-        raise EvaluationError(f"the mission holds no keyscans of {session}")
+        raise InputError(f"the mission holds no keyscans of {session}")
     scans = []
     for keyscan in store.keyscans_near(robot, epoch, stamp, KEYSCANS):
         nearest = int(np.argmin(np.abs(trajectory.stamps - keyscan.stamp)))
@@ -79,6 +79,6 @@ def _submap(store: MissionStore, run: Run, session: str, stamp: float) -> FloatA
             points = keyscan_points(keyscan, hello.lasers).thinned(SPACING_M).points
             scans.append((keyscan.stamp, trajectory.T_map_base[nearest], points))
     if not scans or min(abs(at - stamp) for at, _, _ in scans) > SAME_S:
-        raise EvaluationError(f"the mission holds no keyscan of {session} at {stamp:.3f} s")
+        raise InputError(f"the mission holds no keyscan of {session} at {stamp:.3f} s")
     _, anchor, _ = min(scans, key=lambda scan: abs(scan[0] - stamp))
     return np.concatenate([se2.transform(se2.between(anchor, pose), points) for _, pose, points in scans])

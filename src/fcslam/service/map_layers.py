@@ -9,7 +9,7 @@ from typing import Any, Final
 from fcslam.anchoring.anchors import PLAN_JSON, TAGS_JSON
 from fcslam.anchoring.deviations import DeviationKind
 from fcslam.anchoring.walls import wall_direction
-from fcslam.errors import EvaluationError, SourceError
+from fcslam.errors import InputError, SourceError
 from fcslam.maps.changes import APPEARED, DISAPPEARED
 from fcslam.maps.exports import outlines
 from fcslam.maps.occupancy_map import map_stem, parse_map
@@ -51,7 +51,7 @@ def map_shapes(mission: ViewedMission, k: int, layer: MapLayer) -> list[MapShape
     """A layer of map ``k``; empty if there is nothing to draw.
 
     Raises:
-        EvaluationError: a file of the run is broken or too large.
+        InputError: a file of the run is broken or too large.
     """
     folder = mission.run_folder
     if folder is None or layer not in layers_of(mission, k):
@@ -59,7 +59,7 @@ def map_shapes(mission: ViewedMission, k: int, layer: MapLayer) -> list[MapShape
     if layer is MapLayer.CHANGES:
         found = _changes(viewed_run(folder), mission.store, k)
         if isinstance(found, str):
-            raise EvaluationError(found)
+            raise InputError(found)
         return [*found]
     try:
         content = json.loads(read_text(folder / _FILES[layer], folder, MOST_LAYER_BYTES))
@@ -67,20 +67,20 @@ def map_shapes(mission: ViewedMission, k: int, layer: MapLayer) -> list[MapShape
     except FileNotFoundError:
         return []
     except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise EvaluationError(f"{_FILES[layer]} cannot be shown ({error})") from error
+        raise InputError(f"{_FILES[layer]} cannot be shown ({error})") from error
 
 
 def walls_of(folder: Path, k: int) -> WallDirection:
     """The direction of the walls of map ``k`` of a run folder, which has it.
 
     Raises:
-        EvaluationError: the files of the map are broken.
+        InputError: the files of the map are broken.
     """
     stem = map_stem(k)
     try:
         pgm, description = read_bytes(folder / f"{stem}.pgm", folder), read_text(folder / f"{stem}.yaml", folder)
     except (OSError, ValueError) as error:
-        raise EvaluationError(f"{stem} cannot be read ({error})") from error
+        raise InputError(f"{stem} cannot be read ({error})") from error
     return WallDirection(direction_rad=wall_direction(parse_map(stem, pgm, description)))
 
 

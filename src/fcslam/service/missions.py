@@ -8,7 +8,7 @@ from typing import IO
 
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.cloud.shared_words import SharedWords
-from fcslam.errors import InputError, ServiceError, StoreError
+from fcslam.errors import InputError, StoreError
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Change, Edit, Undo
 from fcslam.service.detectors import STAGING, DetectorStore
@@ -25,7 +25,7 @@ IMPORT, EXPORT = ".import", ".export"
 """Prefixes of temporary folders of imported and exported missions."""
 
 
-class UnknownMissionError(ServiceError):
+class UnknownMissionError(InputError):
     """There is no mission of a name."""
 
     def __init__(self, name: str, names: Iterable[str]) -> None:
@@ -108,7 +108,7 @@ def check_words(name: str, settings: FleetConfig) -> None:
     try:
         SharedWords(settings)
     except InputError as error:
-        raise ServiceError(f"mission '{name}': {error}") from error
+        raise InputError(f"mission '{name}': {error}") from error
 
 
 def _check_file(folder: MissionFolder) -> None:
@@ -152,7 +152,7 @@ class Missions:
     def create(self, name: str) -> None:
         """Create a mission and open it."""
         if MissionFolder.of(self.root, name).store.exists():
-            raise ServiceError(f"mission '{name}' exists; open it or choose another name")
+            raise InputError(f"mission '{name}' exists; open it or choose another name")
         self._switch(name)
 
     def open(self, name: str) -> None:
@@ -183,7 +183,7 @@ class Missions:
         """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open."""
         folder = MissionFolder.of(self.root, name)
         if folder.store.exists():
-            raise ServiceError(f"mission '{name}' exists; choose another name")
+            raise InputError(f"mission '{name}' exists; choose another name")
         with translate_errors(folder.store):
             folder.path.mkdir(parents=True, exist_ok=True)
             with replacing(folder.store) as unfinished:
@@ -243,10 +243,10 @@ def locked(root: Path) -> IO[str]:
         root.mkdir(parents=True, exist_ok=True)
         file = (root / "lock").open("w")
     except OSError as error:
-        raise ServiceError(f"{root}: cannot keep missions there ({error}); name a folder to write in") from error
+        raise InputError(f"{root}: cannot keep missions there ({error}); name a folder to write in") from error
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         file.close()
-        raise ServiceError(f"{root}: another service uses this folder; stop it or name another folder") from error
+        raise InputError(f"{root}: another service uses this folder; stop it or name another folder") from error
     return file

@@ -15,7 +15,7 @@ import fcslam
 from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
 from fcslam.cloud.sessions import session_name
 from fcslam.config import StrictModel
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.maps.exports import earth_frame, zipped
 from fcslam.maps.occupancy_map import HEADER_BYTES, area_of, map_stem
 from fcslam.maps.palette import robot_colors
@@ -170,13 +170,13 @@ def trajectories_zip(folder: Path) -> bytes | None:
     """The trajectories of a run folder as one archive; None if it has none.
 
     Raises:
-        EvaluationError: one cannot be read.
+        InputError: one cannot be read.
     """
     try:
         files = {file.name: read_bytes(file, folder) for file in sorted((folder / TRAJECTORIES).glob("*.tum"))}
         return zipped(files) if files else None
     except (OSError, ValueError) as error:
-        raise EvaluationError(f"the trajectories cannot be read ({error})") from error
+        raise InputError(f"the trajectories cannot be read ({error})") from error
 
 
 def map_separations(mission: ViewedMission) -> list[MapSeparation]:
@@ -230,7 +230,7 @@ def read_rounds(folder: Path) -> list[LearningRound]:
     """The rounds so far, oldest first; none before the first one is done.
 
     Raises:
-        EvaluationError: the table is damaged.
+        InputError: the table is damaged.
     """
     path = folder / ROUNDS_FILE
     try:
@@ -239,7 +239,7 @@ def read_rounds(folder: Path) -> list[LearningRound]:
     except FileNotFoundError:
         return []
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise EvaluationError(f"{path}: is not a table of rounds ({error})") from error
+        raise InputError(f"{path}: is not a table of rounds ({error})") from error
 
 
 def _round(row: dict[str, str]) -> LearningRound:

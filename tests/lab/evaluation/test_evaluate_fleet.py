@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.closures import ClosureScope
 from fcslam.lab.evaluation.ground_truth import read_grid
@@ -299,7 +299,7 @@ def test_bad_folders_are_one_line_and_exit_code_2(folder, capsys, tmp_path):
         assert message in error
         assert error.count("\n") == 1
     Run({}).save(folder, force=True)
-    with pytest.raises(EvaluationError, match="no robot"):
+    with pytest.raises(InputError, match="no robot"):
         evaluate_fleet(folder)
 
 

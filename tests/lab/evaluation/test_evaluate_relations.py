@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.errors import EvaluationError, OutputError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.relations import (
     evaluate_relations,
@@ -68,7 +68,7 @@ def test_one_robot_is_measured_by_the_same_relations_as_several(folders):
 
 def test_one_robot_has_no_relations_across_robots(folders):
     folder, _ = folders
-    with pytest.raises(EvaluationError, match="no relation between different robots spans more than 20 s"):
+    with pytest.raises(InputError, match="no relation between different robots spans more than 20 s"):
         evaluate_relations(folder / "single", folder / "relations", across_robots=True)
 
 
@@ -76,7 +76,7 @@ def test_a_run_of_no_robot_matches_nothing(folders):
     folder, _ = folders
     Run({}).save(folder / "empty")
     assert len(pose_table(Run({})).stamps) == 0
-    with pytest.raises(EvaluationError, match="same recording"):
+    with pytest.raises(InputError, match="same recording"):
         evaluate_relations(folder / "empty", folder / "relations")
 
 
@@ -85,7 +85,7 @@ def test_robots_in_separate_maps_have_no_numbers_across_robots(folders):
     run = open_run(folder / "several")
     apart = {name: replace(each, map_index=k) for k, (name, each) in enumerate(run.trajectories.items())}
     Run(apart).save(folder / "apart")
-    with pytest.raises(EvaluationError, match=r"apart: none of the \d+ relations .* in different maps"):
+    with pytest.raises(InputError, match=r"apart: none of the \d+ relations .* in different maps"):
         evaluate_relations(folder / "apart", folder / "relations", across_robots=True)
 
 
@@ -100,5 +100,5 @@ def test_metrics_are_written_as_csv_and_json(folders):
     assert [row["name"] for row in rows] == [row["name"] for row in content]
     assert {row["name"]: row["unit"] for row in rows}["rotation_error_mean"] == "deg"
     assert float(rows[0]["value"]) == pytest.approx(content[0]["value"]) == pytest.approx(0.1, abs=1e-6)
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(InputError, match="cannot be written"):
         write_metrics(metrics, folder / "missing" / "table.csv")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fcslam.errors import SimulationError
+from fcslam.errors import InputError
 from fcslam.lab.simulation.engine import gl_context
 
 
@@ -10,5 +10,5 @@ def require_gl() -> None:
     """Skip the test, and say what to install, where there is no GL library."""
     try:
         gl_context(16, 16).free()
-    except SimulationError as error:
+    except InputError as error:
         pytest.skip(str(error))

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from fcslam.errors import SimulationError
+from fcslam.errors import InputError
 from fcslam.lab.simulation.drivable_space import ROBOT_RADIUS_M, DrivableSpace
 from fcslam.lab.simulation.floorplan import FloorPlan, Piece, PieceKind, Room, draw_floor_plan, move_furniture
 from fcslam.lab.simulation.options import Building
@@ -144,5 +144,5 @@ def test_goals_move_aside_where_furniture_came():
 
 @pytest.mark.parametrize("changed", [{"pieces": (box(-1.0, -1.0, 9.0, 7.0),)}, {"lanes": (), "rooms": ()}])
 def test_no_space_to_drive_in(changed):
-    with pytest.raises(SimulationError, match="the building"):
+    with pytest.raises(InputError, match="the building"):
         route(replace(halves(), **changed), 10.0, np.random.default_rng(0))

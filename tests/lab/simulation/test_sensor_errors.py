@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fcslam import config
-from fcslam.errors import ConfigError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.simulation.floorplan import draw_floor_plan
 from fcslam.lab.simulation.noise import LidarSettings, simulate_ranges
@@ -145,7 +145,7 @@ def test_default_odometry_is_bad_enough_to_need_a_map(seed):
     "content", [{"robots": 0}, {"path_length_m": -1}, {"lidar": {"dropout": 2}}, {"lidar": {"beam": 3}}]
 )
 def test_impossible_settings_are_refused(content):
-    with pytest.raises(ConfigError, match="fleet"):
+    with pytest.raises(InputError, match="fleet"):
         config.parse(SimulationSettings, content, "fleet")
 
 

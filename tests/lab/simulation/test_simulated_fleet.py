@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.errors import SimulationError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.simulation import engine, textures
 from fcslam.lab.simulation.floorplan import PieceKind, draw_floor_plan
@@ -128,13 +128,13 @@ def test_furniture_moves_before_every_robot_but_the_first():
 
 
 def test_too_many_robots_for_the_building():
-    with pytest.raises(SimulationError, match=r"'flat'.* too small for 50 robots; simulate at most \d"):
+    with pytest.raises(InputError, match=r"'flat'.* too small for 50 robots; simulate at most \d"):
         simulate_fleet(TINY.model_copy(update={"robots": 50}), 1)
 
 
 def test_without_mujoco_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(SimulationError, match=r"needs MuJoCo.*pip install 'fcslam\[sim\]'"):
+    with pytest.raises(InputError, match=r"needs MuJoCo.*pip install 'fcslam\[sim\]'"):
         engine.mujoco()
 
 
@@ -148,7 +148,7 @@ def test_without_a_gl_library_one_line_says_what_to_install(monkeypatch):
         return real(name)
 
     monkeypatch.setattr(importlib, "import_module", without_gl)
-    with pytest.raises(SimulationError, match=r"^no GL library.*apt-get install libegl1 .*--no-camera"):
+    with pytest.raises(InputError, match=r"^no GL library.*apt-get install libegl1 .*--no-camera"):
         engine.gl_context(32, 24)
 
 

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.federated.client import ClientUpdate
 from fcslam.learning.federated.settings import FederatedSettings
 from tests.learning.federated.fakes import Fake
@@ -145,7 +145,7 @@ def test_a_robot_that_sends_noise_is_left_out(fleet, undisturbed, tmp_path):
 
 
 def test_a_robot_cannot_answer_in_the_name_of_another(fleet):
-    with fleet.server(), fleet.link("one", owner=HOSTILE) as link, pytest.raises(TrainingError, match="no token of"):
+    with fleet.server(), fleet.link("one", owner=HOSTILE) as link, pytest.raises(InputError, match="no token of"):
         link.fetch()
 
 

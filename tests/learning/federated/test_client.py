@@ -11,7 +11,7 @@ from tests.learning.textures import textured
 
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 
-from fcslam.errors import TrainingError  # noqa: E402
+from fcslam.errors import InputError  # noqa: E402
 from fcslam.learning.arrays import write_arrays  # noqa: E402
 from fcslam.learning.code_batches import RevisitExamples, RevisitPair  # noqa: E402
 from fcslam.learning.federated.client import RobotClient, robot_seed  # noqa: E402
@@ -121,17 +121,17 @@ def test_what_cannot_be_kept_or_gone_on_with_is_told(folder, start, tmp_path):
     halved = {name: array for name, array in whole.items() if name != "0/exp_avg_sq"}
     for odd in (whole | of_another, halved, {"0/exp_avg": whole["0/exp_avg"]}, {"nonsense": np.zeros(1)}):
         write_arrays(moments, odd)
-        with pytest.raises(TrainingError, match="cannot continue"):
+        with pytest.raises(InputError, match="cannot continue"):
             robot(folder, tmp_path).learn(start, 1)
     write_arrays(moments, {"0/step": np.array("text")})
-    with pytest.raises(TrainingError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot be read"):
         robot(folder, tmp_path).learn(start, 1)
     moments.write_bytes(b"broken")
-    with pytest.raises(TrainingError, match=rf"{moments.name}: the optimizer's state cannot be read"):
+    with pytest.raises(InputError, match=rf"{moments.name}: the optimizer's state cannot be read"):
         robot(folder, tmp_path).learn(start, 1)
     moments.unlink()
     moments.mkdir()
-    with pytest.raises(TrainingError, match=rf"{moments.name}: the optimizer's state cannot be kept"):
+    with pytest.raises(InputError, match=rf"{moments.name}: the optimizer's state cannot be kept"):
         robot(folder, tmp_path).learn(start, 0)
 
 
@@ -148,15 +148,15 @@ def test_too_few_images_are_said(content, start, tmp_path):
     if content == "broken":
         for index in range(5):
             (images / f"{index}.png").write_bytes(b"no image")
-    with pytest.raises(TrainingError, match=r"images: holds no image|only . of . image files can be trained on"):
+    with pytest.raises(InputError, match=r"images: holds no image|only . of . image files can be trained on"):
         robot(images, tmp_path / "labels").learn(start, 0)
 
 
 def test_weights_of_another_network_are_refused(folder, start, tmp_path):
     chosen = settings(training={"encoder": "vgg"} | TINY["training"])
-    with pytest.raises(TrainingError, match="no weights of a vgg network"):
+    with pytest.raises(InputError, match="no weights of a vgg network"):
         robot(folder, tmp_path).learn(start, chosen=chosen)
-    with pytest.raises(TrainingError, match="not those of a light network"):
+    with pytest.raises(InputError, match="not those of a light network"):
         network_from_state("light", {})
 
 
@@ -188,7 +188,7 @@ def test_codes_are_trained_on_revisits_and_need_no_image_files(start, tmp_path, 
     assert changed <= layer_names(network, network.body.code_layers)
     assert not any(name.endswith(("running_mean", "running_var")) for name in changed)
     assert not same(found, update("b", RevisitExamples(seen_again.images[::-1], seen_again.pairs)))
-    with pytest.raises(TrainingError, match="no place was"):
+    with pytest.raises(InputError, match="no place was"):
         update("c", RevisitExamples(seen_again.images))
 
 
@@ -213,5 +213,5 @@ def test_codes_are_kept_to_those_of_the_run_s_first_weights(start, tmp_path, see
     assert not same(learn(restarted, moved, 1), later)
     former.unlink()
     former.mkdir()
-    with pytest.raises(TrainingError, match=rf"{former.name}: the weights of the first round cannot be kept"):
+    with pytest.raises(InputError, match=rf"{former.name}: the weights of the first round cannot be kept"):
         learn(restarted, start, 0)

@@ -10,7 +10,7 @@ pytest.importorskip("torch", reason="needs fcslam[federated]")
 
 from evaluation.federated.poison import PoisonedClient
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.federated.aggregation import average
 from fcslam.learning.federated.checkpoint import CHECKPOINT_FILE, read_state
 from fcslam.learning.federated.fleets import InProcessFleet
@@ -166,7 +166,7 @@ def test_the_order_of_robots_does_not_matter(tmp_path):
 
 
 def refuses(*_args):
-    raise TrainingError("no images here")
+    raise InputError("no images here")
 
 
 def breaks(*_args):
@@ -224,7 +224,7 @@ def test_bytes_are_those_of_the_arrays(tmp_path):
 
 def test_without_anybody_the_server_says_so_or_waits(tmp_path):
     robots = [Fake("a", answer=refuses)]
-    with pytest.raises(TrainingError, match="no round can be completed: a: no images here"):
+    with pytest.raises(InputError, match="no round can be completed: a: no images here"):
         run(robots, tmp_path)
     waited = []
 
@@ -343,11 +343,11 @@ def test_a_start_that_nothing_beats_stays(tmp_path):
 
 def test_a_checkpoint_of_another_run_is_refused_but_more_rounds_are_not(tmp_path):
     run([Fake("a")], tmp_path)
-    with pytest.raises(TrainingError, match=r"other settings \(local_steps\)"):
+    with pytest.raises(InputError, match=r"other settings \(local_steps\)"):
         run([Fake("a")], tmp_path, settings(local_steps=2))
-    with pytest.raises(TrainingError, match="began from"):
+    with pytest.raises(InputError, match="began from"):
         run([Fake("a")], tmp_path, start=shifted(START, 1.0))
-    with pytest.raises(TrainingError, match="its weights do not fit"):
+    with pytest.raises(InputError, match="its weights do not fit"):
         run([Fake("a")], tmp_path, start={"other": np.zeros(3, np.float32)})
     state, reports = run([Fake("a")], tmp_path, settings(rounds=3))
     assert (state.rounds_done, len(reports)) == (3, 1)
@@ -356,5 +356,5 @@ def test_a_checkpoint_of_another_run_is_refused_but_more_rounds_are_not(tmp_path
 def test_a_broken_checkpoint_is_told_as_such(tmp_path):
     run([Fake("a")], tmp_path)
     (tmp_path / CHECKPOINT_FILE).write_bytes(b"nonsense")
-    with pytest.raises(TrainingError, match="is not a checkpoint"):
+    with pytest.raises(InputError, match="is not a checkpoint"):
         run([Fake("a")], tmp_path)

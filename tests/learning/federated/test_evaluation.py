@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
 from fcslam.cli.federate import round_line
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.federated.evaluation import PUBLIC_IMAGES, VersionComparison, valid_metrics
 from fcslam.learning.federated.fleets import InProcessFleet
 from tests.learning.federated.fakes import START, Fake, rules, run, settings, shifted
@@ -91,7 +91,7 @@ def test_nobody_who_can_judge_is_waited_for_and_is_no_collapse(tmp_path):
         def evaluate(self, request):
             self.asked_to_judge += 1
             if self.asked_to_judge in (1, 3, 4):
-                raise TrainingError("the disk is gone")
+                raise InputError("the disk is gone")
             return super().evaluate(request)
 
     waited = []
@@ -99,7 +99,7 @@ def test_nobody_who_can_judge_is_waited_for_and_is_no_collapse(tmp_path):
     assert waited == ["a: the disk is gone"] * 3
     assert [(report.released, report.returned) for report in reports] == [(True, False)] * 2
     assert state.rounds_done == 2
-    with pytest.raises(TrainingError, match="the disk is gone"):
+    with pytest.raises(InputError, match="the disk is gone"):
         run([Sick("a")], tmp_path / "ends", evaluate_fn=None)
 
 
@@ -118,7 +118,7 @@ def test_a_robot_that_only_fails_to_judge_the_best_is_named(tmp_path):
     class Late(Judging):
         def evaluate(self, request):
             if request.weights["b.weight"] < START["b.weight"] + 0.25:
-                raise TrainingError("too dark")
+                raise InputError("too dark")
             return super().evaluate(request)
 
     _, reports = run_coming([Judging("a", slope=-0.01), Late("b", slope=-0.01)], [0, 2], tmp_path, rounds=4)

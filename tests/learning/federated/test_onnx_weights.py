@@ -8,7 +8,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.errors import TrainingError  # noqa: E402
+from fcslam.errors import InputError  # noqa: E402
 from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector, network_file  # noqa: E402
 from fcslam.learning.export import export_onnx  # noqa: E402
 from fcslam.learning.federated.initial_weights import prepare_initial_weights, read_detector_weights  # noqa: E402
@@ -120,7 +120,7 @@ def test_a_fleet_goes_on_from_the_start_it_had_whatever_public_images_there_are_
     assert all(np.array_equal(begun[name], again[name]) for name in begun)
     (kept,) = tmp_path.glob("start-*.npz")
     kept.write_bytes(b"torn")
-    with pytest.raises(TrainingError, match="is broken"):
+    with pytest.raises(InputError, match="is broken"):
         first([pictures[1]])
     kept.unlink()
     assert any((begun[name] != array).any() for name, array in first([pictures[1]]).items())
@@ -132,5 +132,5 @@ def test_another_network_is_refused_by_name(tmp_path):
     (tmp_path / "text.onnx").write_text("hello")
     tiny_network(tmp_path / "tiny.onnx")
     for name, encoder in (("light", "vgg"), ("text", "light"), ("tiny", "light")):
-        with pytest.raises(TrainingError, match=name):
+        with pytest.raises(InputError, match=name):
             read_detector_weights(tmp_path / f"{name}.onnx", encoder)

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.federated.fleets import InProcessFleet
 from fcslam.learning.federated.history import ROUNDS_FILE, read_rows
 from fcslam.learning.federated.messages import (
@@ -196,5 +196,5 @@ BROKEN = {
 def test_bytes_that_are_no_message_are_refused(data):
     with pytest.raises(ValueError, match=r"."):
         read_reply(data)
-    with pytest.raises(TrainingError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot be read"):
         read_request(data)

@@ -18,7 +18,7 @@ import yaml
 from fcslam.cloud import recognition
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.recognition import VocabularyState
-from fcslam.errors import ServiceError, StoreError
+from fcslam.errors import InputError, StoreError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.maps.palette import ROBOTS
 from fcslam.mission.mission_store import MissionStore
@@ -559,7 +559,7 @@ def test_the_open_mission_is_open_again_when_the_service_starts_again(tmp_path, 
 
 
 def test_two_services_do_not_share_a_folder(desk):
-    with pytest.raises(ServiceError, match="another service"):
+    with pytest.raises(InputError, match="another service"):
         Desk(desk.state.missions.root)
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import ServiceError, StoreError
+from fcslam.errors import InputError, StoreError
 from fcslam.mission.mission_store import MissionStore
 from fcslam.service.intake import BusyError, LeaseError
 from fcslam.service.shared.agents import CONFIRM_S, RobotLimit, SharedAgents
@@ -149,7 +149,7 @@ def test_two_instances_of_one_name_are_refused(registry, postgres, monkeypatch):
     one, _ = instance(postgres, "same")
     one.start()
     again = Registry(postgres, "same", "another process")
-    with pytest.raises(ServiceError, match="is called 'same'; stop it, or give this one another --port"):
+    with pytest.raises(InputError, match="is called 'same'; stop it, or give this one another --port"):
         Instance(again, "same", 1, Hooks(Started, lambda *_: None, lambda: None))
     one.close()
     Instance(again, "same", 1, Hooks(Started, lambda *_: None, lambda: None)).close()

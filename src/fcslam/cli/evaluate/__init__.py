@@ -8,7 +8,7 @@ import typer
 
 from fcslam.cli.options import Csv
 from fcslam.cli.output import notices
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 
 RunFolder = Annotated[Path, typer.Argument(help="Run folder to measure.")]
 
@@ -72,11 +72,11 @@ def quality(run: RunFolder) -> None:
 
     content = open_run(run).quality.get(f"{QUALITY}.json")
     if content is None:
-        raise EvaluationError(f"{run}: has no {QUALITY}.json; map the recordings again with this version")
+        raise InputError(f"{run}: has no {QUALITY}.json; map the recordings again with this version")
     try:
         certificates = dict(json.loads(content))
     except (ValueError, TypeError) as error:
-        raise EvaluationError(f"{run}: {QUALITY}.json is broken ({error})") from error
+        raise InputError(f"{run}: {QUALITY}.json is broken ({error})") from error
     for k, one in certificates.items():
         typer.echo(f"map {k}: {one['verdict']}")
         for stretch in one["open_stretches"]:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from fcslam.config import one_line, parse_yaml
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.features.detector import decode_grey
 from fcslam.lab.evaluation.relations import pose_table
 from fcslam.maps.occupancy_map import check_place
@@ -45,14 +45,14 @@ def truth_folder(run: Path, named: Path | None) -> Path:
     beside = run.resolve().parent / "recordings"
     folder = named or (beside if beside.is_dir() else run.resolve().parent)
     if not folder.is_dir():
-        raise EvaluationError(f"{folder}: no folder with the truth; name one with --truth")
+        raise InputError(f"{folder}: no folder with the truth; name one with --truth")
     return folder
 
 
 def known_poses(run: Run, folder: Path) -> KnownPoses:
     """Interpolate the true poses at the stamps of a run."""
     if not run.trajectories:
-        raise EvaluationError("the run has no robot, so there is nothing to compare with the truth")
+        raise InputError("the run has no robot, so there is nothing to compare with the truth")
     estimate = pose_table(run)
     true = np.empty_like(estimate.T_map_base)
     for number, trajectory in enumerate(run.trajectories.values()):
@@ -79,7 +79,7 @@ def read_grid(path: Path) -> LabelledGrid:
         if not (origin.shape == (3,) and np.isfinite(origin).all()):
             raise ValueError("resolution or origin is wrong")
     except (OSError, ValueError, TypeError, KeyError, cv2.error) as error:
-        raise EvaluationError(f"{path}: not a map of ROS map_server ({error!r})") from error
+        raise InputError(f"{path}: not a map of ROS map_server ({error!r})") from error
     occupancy = (pixels if meta.get("negate") else 255 - pixels)[::-1] / 255.0
     return LabelledGrid(occupancy > occupied_over, occupancy < free_under, resolution_m, frozen(origin))
 
@@ -89,17 +89,17 @@ def _true_poses(trajectory: RobotTrajectory, stamps: FloatArray, folder: Path) -
     places = folder / trajectory.robot / "ground_truth.tum", folder / f"{trajectory.robot}.tum"
     path = next((place for place in places if place.is_file()), None)
     if path is None:
-        raise EvaluationError(
+        raise InputError(
             f"{folder}: no truth of '{trajectory.robot}', neither {places[0].relative_to(folder)} nor "
             f"{places[1].name}; name the folder that has it with --truth"
         )
     known, poses = read_tum(path)
     if not len(known):
-        raise EvaluationError(f"{path}: empty, so where '{trajectory.robot}' was is not known")
+        raise InputError(f"{path}: empty, so where '{trajectory.robot}' was is not known")
     true = interpolate(known, poses, stamps, GAP_S)
     covered = int(np.isfinite(true[:, 0]).sum())
     if covered < max(LEAST_COVERED * len(stamps), 1):
-        raise EvaluationError(
+        raise InputError(
             f"{path}: has poses at only {covered} of the {len(stamps)} scans of '{trajectory.robot}'; "
             "is it the truth of another recording?"
         )

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fcslam.errors import EvaluationError, writing
+from fcslam.errors import InputError, writing
 from fcslam.metrics.relations import (
     ACROSS_ROBOTS_GAP_S,
     PoseTable,
@@ -33,11 +33,11 @@ def evaluate_relations(
     selected = select(reference, robots, gap_s, across_robots)
     if not len(selected):
         which = "between different robots" if across_robots else "in it"
-        raise EvaluationError(f"{relations}: no relation {which} spans more than {gap_s:g} s")
+        raise InputError(f"{relations}: no relation {which} spans more than {gap_s:g} s")
     errors = relation_errors(selected, poses)
     if not errors.used:
         hint = "; the robots are in different maps, which closures.csv explains" if across_robots else ""
-        raise EvaluationError(f"{run}: none of the {errors.total} relations has both its poses in one map{hint}")
+        raise InputError(f"{run}: none of the {errors.total} relations has both its poses in one map{hint}")
     return errors
 
 

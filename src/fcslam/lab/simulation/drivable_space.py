@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
-from fcslam.errors import SimulationError
+from fcslam.errors import InputError
 from fcslam.geometry.cell_graph import cell_graph
 from fcslam.lab.simulation.floorplan import FloorPlan, PieceKind
 from fcslam.records import FloatArray, frozen
@@ -47,7 +47,7 @@ class DrivableSpace:
         self._clearance_m = _CELL_M * distance_transform_edt(~obstacle_cells(plan))
         parts, count = label(self._clearance_m[::_STEP, ::_STEP] >= _CLEARANCE_M, np.ones((3, 3)))
         if not count:
-            raise SimulationError(
+            raise InputError(
                 f"the building has no place for a robot of {ROBOT_RADIUS_M:g} m radius; make its corridors wider"
             )
         self._inside: Cells = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])

@@ -7,7 +7,7 @@ from contextlib import suppress
 from threading import RLock
 from typing import Any
 
-from fcslam.errors import SimulationError
+from fcslam.errors import InputError
 
 _GL = "MUJOCO_GL"
 _BACKENDS = ("egl", "osmesa")
@@ -22,7 +22,7 @@ def mujoco() -> Any:
     """Import ``mujoco`` without GL, which it would otherwise load at import.
 
     Raises:
-        SimulationError: it is not installed.
+        InputError: it is not installed.
     """
     with GL_LOCK:
         if loaded := sys.modules.get("mujoco"):
@@ -32,7 +32,7 @@ def mujoco() -> Any:
         try:
             return importlib.import_module("mujoco")
         except ImportError as error:
-            raise SimulationError(f"the simulator needs MuJoCo ({error}); pip install 'fcslam[sim]'") from error
+            raise InputError(f"the simulator needs MuJoCo ({error}); pip install 'fcslam[sim]'") from error
         finally:
             os.environ.pop(_GL)
             if wanted is not None:
@@ -43,7 +43,7 @@ def gl_context(width: int, height: int) -> Any:
     """Make an off-screen GL context current: EGL, or OSMesa without EGL. MUJOCO_GL selects one of them.
 
     Raises:
-        SimulationError: there is no GL library.
+        InputError: there is no GL library.
     """
     mujoco()
     wanted = os.environ.get(_GL, "").lower()
@@ -53,7 +53,7 @@ def gl_context(width: int, height: int) -> Any:
             context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
             context.make_current()
             return context
-    raise SimulationError(
+    raise InputError(
         f"no GL library for the cameras: apt-get install {_PACKAGES} (or libosmesa6), or leave the cameras off "
         "(--no-camera)"
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 import fcslam
 from fcslam.config import dump
-from fcslam.errors import OutputError, writing
+from fcslam.errors import InputError, writing
 from fcslam.geometry import se2
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings
 from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
@@ -44,7 +44,7 @@ def prepare_fleet_folder(folder: Path, settings: SimulationSettings, seed: int) 
     with writing(folder, "choose another output folder"):
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
-            raise OutputError(f"{folder}: is not empty; choose another place")
+            raise InputError(f"{folder}: is not empty; choose another place")
         write_file(folder / SETTINGS, text)
 
 

@@ -6,7 +6,7 @@ from itertools import cycle
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.errors import SimulationError
+from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.simulation.drivable_space import DrivableSpace
 from fcslam.lab.simulation.floorplan import FloorPlan
@@ -134,7 +134,7 @@ def _draw_spots(plan: FloorPlan, space: DrivableSpace, rng: np.random.Generator)
 
 def _check_spread(points: FloatArray) -> None:
     if not len(points) or np.ptp(points, axis=0).max() < _LEAST_SPREAD_M:
-        raise SimulationError("the building's free space is too small or too divided to drive in; take a larger one")
+        raise InputError("the building's free space is too small or too divided to drive in; take a larger one")
 
 
 def _swayed(leg: FloatArray, space: DrivableSpace, rng: np.random.Generator) -> FloatArray:

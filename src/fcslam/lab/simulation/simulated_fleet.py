@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.errors import SimulationError
+from fcslam.errors import InputError
 from fcslam.lab.simulation.decoration import Decoration, decorate, light_of
 from fcslam.lab.simulation.floorplan import FloorPlan
 from fcslam.lab.simulation.noise import SCANNERS, LidarSettings, simulate_ranges
@@ -240,7 +240,7 @@ def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
     lanes_m = sum(float(np.linalg.norm(end - start)) for start, end in plan.lanes)
     most = int(lanes_m / LANE_PER_ROBOT_M)
     if settings.robots > most:
-        raise SimulationError(
+        raise InputError(
             f"building '{settings.building}': {lanes_m:.0f} m of corridors are too small for {settings.robots} robots; "
             f"simulate at most {most}, or take a larger building"
         )

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.federated.weights import Weights, parameter_names, weights_error
 
 Aggregate = Callable[[int, Sequence[Weights]], Weights]
@@ -39,7 +39,7 @@ def next_weights(
         following, momentum = apply_momentum(aggregated, old, momentum, share)
         reason = weights_error(following, old)
     if reason is not None:
-        raise TrainingError(f"round {round_number}: the strategy gave unusable weights: {reason}")
+        raise InputError(f"round {round_number}: the strategy gave unusable weights: {reason}")
     return {name: following[name] for name in old}, momentum
 
 

@@ -10,7 +10,7 @@ from typing import Any, Final, Self
 import numpy as np
 import torch
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, weights_error
@@ -89,7 +89,7 @@ def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin
         return None
     checkpoint = read_checkpoint(path)
     if checkpoint.stage != STAGE:
-        raise TrainingError(f"{path}: is not a checkpoint of federated training; give another --output")
+        raise InputError(f"{path}: is not a checkpoint of federated training; give another --output")
     groups = {
         group: {name: tensor.numpy() for name, tensor in checkpoint.part(f"{group}/").items()} for group in GROUPS
     }
@@ -106,21 +106,21 @@ def read_state(path: Path, settings: FederatedSettings, initial: Weights, origin
             update_length=float(header["update_length"]),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise TrainingError(
+        raise InputError(
             f"{path}: is not a checkpoint of this version of fcslam ({error}); give another --output"
         ) from error
     asked = _fixed(settings.model_dump(mode="json"))
     others = sorted(name for name in asked.keys() | fixed.keys() if asked.get(name) != fixed.get(name))
     if others:
-        raise TrainingError(
+        raise InputError(
             f"{path}: belongs to a run with other settings ({', '.join(others)}); give the same or another --output"
         )
     for group in ("weights", "average", "best"):
         reason = weights_error(groups[group], initial)
         if reason is not None:
-            raise TrainingError(f"{path}: its {group} do not fit this network ({reason})")
+            raise InputError(f"{path}: its {group} do not fit this network ({reason})")
     if state.origin != origin:
-        raise TrainingError(
+        raise InputError(
             f"{path}: belongs to a run that began from {state.origin}, not from {origin}; give another --output"
         )
     return state

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.arrays import write_arrays
 from fcslam.learning.federated.weights import Weights
 from fcslam.untrusted import read_arrays
@@ -68,8 +68,8 @@ def _checksum(run_id: str) -> str:
 
 @contextlib.contextmanager
 def translate_errors(path: Path, failure: str) -> Iterator[None]:
-    """Raise errors of reading or writing ``path`` as TrainingError; ``failure`` says what could not be done."""
+    """Raise errors of reading or writing ``path`` as InputError; ``failure`` says what could not be done."""
     try:
         yield
     except (OSError, TypeError, ValueError) as error:  # torch does not support every dtype of NumPy
-        raise TrainingError(f"{path}: {failure} ({error}); free disk space or remove the file") from error
+        raise InputError(f"{path}: {failure} ({error}); free disk space or remove the file") from error

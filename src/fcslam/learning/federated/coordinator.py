@@ -13,7 +13,7 @@ from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.federated.aggregation import Aggregate, average, next_weights
 from fcslam.learning.federated.checkpoint import CHECKPOINT_FILE, CoordinatorState, read_state, run_id, write_state
 from fcslam.learning.federated.evaluation import (
@@ -296,7 +296,7 @@ class Coordinator:
 
     def _wait_or_fail(self, reason: str) -> None:
         if self._hooks.wait is None:
-            raise TrainingError(f"no round can be completed: {reason}")
+            raise InputError(f"no round can be completed: {reason}")
         self._hooks.wait(reason)
 
     def _request(self, weights: Weights, round_number: int, *, is_training: bool) -> TrainingRequest:

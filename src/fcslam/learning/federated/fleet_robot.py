@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 import httpx
 
-from fcslam.errors import TrainingError, UnavailableError
+from fcslam.errors import InputError, UnavailableError
 from fcslam.learning.federated.client import FederatedClient, answer
 from fcslam.learning.federated.fleet_server import LONG_POLL_S, NUMBER_HEADER
 from fcslam.learning.federated.messages import TrainingReply, printable_line, read_request, write_reply
@@ -54,7 +54,7 @@ class RobotLink(HttpClient):
         """A request with its number; None if no request waits.
 
         Raises:
-            TrainingError: the server does not accept the robot.
+            InputError: the server does not accept the robot.
             ConnectionError: the server cannot be reached, or is not a server of a fleet.
         """
         status, headers, body = self._post("next")
@@ -69,7 +69,7 @@ class RobotLink(HttpClient):
         """Bring a reply; returns the reason why the server does not want it, or None.
 
         Raises:
-            TrainingError, ConnectionError: as in ``fetch``.
+            InputError, ConnectionError: as in ``fetch``.
         """
         status, _, answer = self._post(f"reply/{number}", body)
         return None if status == httpx.codes.NO_CONTENT else answer.decode(errors="replace") or f"status {status}"
@@ -78,7 +78,7 @@ class RobotLink(HttpClient):
         """Show the server that the robot is still there.
 
         Raises:
-            TrainingError, ConnectionError: as in ``fetch``.
+            InputError, ConnectionError: as in ``fetch``.
         """
         self._post("alive")
 
@@ -93,7 +93,7 @@ class RobotLink(HttpClient):
         except UnavailableError as error:
             raise ConnectionError(str(error)) from error
         if response.status_code in (httpx.codes.UNAUTHORIZED, httpx.codes.FORBIDDEN):
-            raise TrainingError(f"the server does not accept this robot: {content.decode(errors='replace')}")
+            raise InputError(f"the server does not accept this robot: {content.decode(errors='replace')}")
         return response.status_code, response.headers, bytes(content)
 
 
@@ -110,7 +110,7 @@ def serve_requests(
     ``is_ready`` is asked before each request; if false, the robot asks for none now.
 
     Raises:
-        TrainingError: the server does not accept the robot.
+        InputError: the server does not accept the robot.
     """
 
     def fetch() -> tuple[int, bytes] | None:
@@ -136,7 +136,7 @@ def serve_requests(
 def _answer(client: FederatedClient, data: bytes) -> TrainingReply:
     try:
         return answer(client, read_request(data))
-    except TrainingError as error:
+    except InputError as error:
         return TrainingReply(client.name, "", error=str(error))
 
 
@@ -156,7 +156,7 @@ def _signs_of_life(link: RobotLink) -> Iterator[None]:
 
     def show() -> None:
         while not ended.wait(ALIVE_S):
-            with contextlib.suppress(ConnectionError, TrainingError):
+            with contextlib.suppress(ConnectionError, InputError):
                 link.show_alive()
 
     thread = threading.Thread(target=show, name="signs of life", daemon=True)

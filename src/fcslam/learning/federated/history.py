@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from fcslam.errors import TrainingError, writing
+from fcslam.errors import InputError, writing
 from fcslam.storage.files import write_file
 
 ROUNDS_FILE: Final = "rounds.csv"
@@ -76,7 +76,7 @@ def read_rows(path: Path, last: int) -> list[Row]:
         with path.open(newline="", encoding="utf-8") as file:
             return [row for row in csv.DictReader(file) if int(row["round"]) <= last]
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise TrainingError(f"{path}: is not a table of rounds ({error}); remove it") from error
+        raise InputError(f"{path}: is not a table of rounds ({error}); remove it") from error
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:

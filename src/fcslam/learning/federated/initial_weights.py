@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.errors import OutputError, TrainingError
+from fcslam.errors import InputError
 from fcslam.features.detector import GreyImage, network_file
 from fcslam.learning.arrays import write_arrays
 from fcslam.learning.checkpoint import read_checkpoint
@@ -50,11 +50,9 @@ def prepare_initial_weights(
             write_arrays(kept, with_batch_statistics(weights, encoder, statistics_images(public)))
         return network_to_weights(weights_to_network(read_arrays(kept), encoder))
     except OSError as error:
-        raise OutputError(
-            f"{kept}: cannot be used ({error}); free disk space and run the same command again"
-        ) from error
-    except (ValueError, TrainingError) as error:
-        raise TrainingError(f"{kept}: is broken ({error}); remove it") from error
+        raise InputError(f"{kept}: cannot be used ({error}); free disk space and run the same command again") from error
+    except (ValueError, InputError) as error:
+        raise InputError(f"{kept}: is broken ({error}); remove it") from error
 
 
 def read_detector_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.float32]]:
@@ -70,4 +68,4 @@ def read_detector_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.
         }
         if arrays:
             return network_to_weights(weights_to_network(arrays, encoder))
-    raise TrainingError(f"{path}: holds no weights of a detector")
+    raise InputError(f"{path}: holds no weights of a detector")

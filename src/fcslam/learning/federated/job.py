@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.config import dump
-from fcslam.errors import TrainingError, writing
+from fcslam.errors import InputError, writing
 from fcslam.learning.artifacts import write_artifacts
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.client import RobotClient
@@ -115,10 +115,10 @@ def federate_locally(
     names = [folder.resolve().name for folder in folders]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
-        raise TrainingError(f"two folders are called {min(twice)}; a robot has its folder's name, so rename one")
+        raise InputError(f"two folders are called {min(twice)}; a robot has its folder's name, so rename one")
     for folder in folders:
         if not folder.is_dir():
-            raise TrainingError(f"{folder}: is not a folder; give one folder of images for each robot")
+            raise InputError(f"{folder}: is not a folder; give one folder of images for each robot")
     clients = [
         RobotClient(
             name, folder, job.output / "robots" / name, options.device, callbacks.steps, most_images=most_images

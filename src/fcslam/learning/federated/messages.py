@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.errors import TrainingError, printable
+from fcslam.errors import InputError, printable
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, size_bytes
 
@@ -79,7 +79,7 @@ def read_request(data: bytes) -> TrainingRequest:
     """Read a request on the robot.
 
     Raises:
-        TrainingError: these bytes are not a request of this version of fcslam.
+        InputError: these bytes are not a request of this version of fcslam.
     """
     try:
         header, weights = _unpack(data)
@@ -96,7 +96,7 @@ def read_request(data: bytes) -> TrainingRequest:
             settings,
         )
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise TrainingError(
+        raise InputError(
             f"the server's request cannot be read ({error}); install the same version of fcslam on both machines"
         ) from error
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.learning.export import detector_version
 from fcslam.learning.federated.weights import Weights, weights_error
 from fcslam.learning.local_training import network_from_state
@@ -31,12 +31,12 @@ def weights_to_network(weights: Weights, encoder: Encoder) -> KeypointNetwork:
     """A network with these weights, in evaluation mode.
 
     Raises:
-        TrainingError: the weights belong to another network, or are not finite.
+        InputError: the weights belong to another network, or are not finite.
     """
     empty = KeypointNetwork(encoder)
     reason = weights_error(weights, network_to_weights(empty))
     if reason is not None:
-        raise TrainingError(f"no weights of a {encoder} network: {reason}")
+        raise InputError(f"no weights of a {encoder} network: {reason}")
     tensors = {name: torch.from_numpy(np.asarray(array, order="C")) for name, array in weights.items()}
     return network_from_state(encoder, empty.state_dict() | tensors)
 

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network
@@ -35,7 +35,7 @@ def read_onnx_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.floa
     try:
         graph = onnx.load(str(path)).graph
     except Exception as error:  # errors of protobuf, of the system and of onnx
-        raise TrainingError(f"{path}: is not an ONNX file ({error})") from error
+        raise InputError(f"{path}: is not an ONNX file ({error})") from error
     weights = network_to_weights(KeypointNetwork(encoder))
     arrays = {array.name: np.array(onnx.numpy_helper.to_array(array)) for array in graph.initializer}
     for node in graph.node:
@@ -49,7 +49,7 @@ def read_onnx_weights(path: Path, encoder: Encoder) -> dict[str, NDArray[np.floa
             given |= _unfold(module, found[0], found[1:], weights)
     missing = sorted(name for name in weights if name not in given)
     if missing:
-        raise TrainingError(f"{path}: holds no {missing[0]} of a {encoder} detector in float32")
+        raise InputError(f"{path}: holds no {missing[0]} of a {encoder} detector in float32")
     # Through a network, which checks names, shapes and values.
     return network_to_weights(weights_to_network({name: given[name] for name in weights}, encoder))
 

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from fcslam.errors import TrainingError
+from fcslam.errors import InputError
 from fcslam.features.detector import GreyImage
 from fcslam.learning.federated.evaluation import EvaluateFn, Metrics
 from fcslam.learning.federated.networks import weights_to_network
@@ -29,7 +29,7 @@ def read_public_images(roots: Sequence[Path]) -> list[GreyImage]:
     images = [image for file in find_images(roots) if (image := read_image(file.path)) is not None]
     usable = [image for image in images if is_usable(image)]
     if not usable:
-        raise TrainingError(f"{roots[0]}: no image there is large enough and has enough corners to evaluate detectors")
+        raise InputError(f"{roots[0]}: no image there is large enough and has enough corners to evaluate detectors")
     return usable
 
 

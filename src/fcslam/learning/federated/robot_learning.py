@@ -18,7 +18,7 @@ from typing import Final
 
 import torch
 
-from fcslam.errors import FcslamError, TrainingError
+from fcslam.errors import FcslamError, InputError
 from fcslam.learning.code_training import CodeInputs
 from fcslam.learning.federated.client import RobotClient
 from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
@@ -56,10 +56,10 @@ class LearningRobot:
         """Between two steps: wait while the robot is busy.
 
         Raises:
-            TrainingError: the budget is spent.
+            InputError: the budget is spent.
         """
         if time.process_time() > self._settings.cpu_s:
-            raise TrainingError(f"{self._client.name} has spent its CPU time for learning")
+            raise InputError(f"{self._client.name} has spent its CPU time for learning")
         self._idle.wait()
 
     def prepare(self) -> bool:
@@ -96,7 +96,7 @@ def learn(open_link: Callable[[], RobotLink], client: RobotClient, robot: Learni
     """Join rounds until learning ends; returns why.
 
     Raises:
-        TrainingError: the server does not accept the robot.
+        InputError: the server does not accept the robot.
         CloudError: the server's address or certificate cannot be used.
     """
     told = ""

@@ -14,7 +14,7 @@ from pydantic import AwareDatetime, Field
 
 from fcslam.cloud.sessions import check_robot
 from fcslam.config import Settings, load
-from fcslam.errors import PacketError, ServiceError
+from fcslam.errors import InputError, PacketError
 from fcslam.records import NAME
 
 
@@ -107,5 +107,5 @@ def read_tokens(path: Path) -> tuple[TokenEntry, ...]:
         values = [getattr(entry, what) for entry in tokens]
         double = next((entry for entry in tokens if values.count(getattr(entry, what)) > 1), None)
         if double:
-            raise ServiceError(f"{path}: two entries have the {what} of '{double.name}'; each needs its own")
+            raise InputError(f"{path}: two entries have the {what} of '{double.name}'; each needs its own")
     return tokens

@@ -11,7 +11,7 @@ from starlette.concurrency import run_in_threadpool
 
 from fcslam.cloud.edits import read_edit
 from fcslam.config import StrictModel
-from fcslam.errors import EditError
+from fcslam.errors import InputError, StoreError
 from fcslam.records import Change, Undo
 from fcslam.service.detectors import LONGEST_FILE_BYTES
 from fcslam.service.http.authentication import Role
@@ -100,6 +100,8 @@ def _edit(state: ServiceState, author: str, content: Change | Undo) -> EditSumma
     mission = state.mission
     try:
         mission.store.check_named(content)
-    except EditError as error:
+    except StoreError:
+        raise
+    except InputError as error:
         raise HTTPException(404, str(error)) from error
     return edit_summary(mission.edit(content, author), {})

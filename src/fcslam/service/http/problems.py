@@ -12,12 +12,11 @@ from starlette.responses import JSONResponse
 from starlette.routing import Match
 
 from fcslam.errors import (
-    EditError,
     FcslamError,
     FeatureError,
+    InputError,
     PacketConflictError,
     PacketError,
-    ServiceError,
     StoreError,
 )
 from fcslam.service.intake import BusyError, LeaseError, RefusedPacketError
@@ -31,8 +30,7 @@ STATUS: dict[type[FcslamError], int] = {
     PacketError: 400,
     StoreError: 507,
     UnknownMissionError: 404,
-    ServiceError: 409,
-    EditError: 409,
+    InputError: 409,
     FeatureError: 400,
 }
 """HTTP status by exception class; the most derived class counts."""

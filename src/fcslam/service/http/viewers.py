@@ -14,7 +14,7 @@ from fastapi.responses import FileResponse, Response, StreamingResponse
 from pydantic import Field, TypeAdapter
 from starlette.concurrency import run_in_threadpool
 
-from fcslam.errors import EvaluationError
+from fcslam.errors import InputError
 from fcslam.maps.exports import export_map
 from fcslam.maps.occupancy_map import map_stem
 from fcslam.maps.tiles import DEEPEST_ZOOM, tile_png
@@ -323,7 +323,7 @@ def _or_404() -> Iterator[None]:
     """Refuse (HTTPException 404) what cannot be read of a run."""
     try:
         yield
-    except EvaluationError as error:
+    except InputError as error:
         raise HTTPException(404, str(error)) from error
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from fcslam.errors import ServiceError, StoreError
+from fcslam.errors import InputError, StoreError
 from fcslam.service.shared.mission_tables import Lease
 from fcslam.service.shared.registry import LEASE_S, KnownMission, Registry
 from fcslam.service.supervisor import RunningWorker
@@ -102,7 +102,7 @@ class Instance:
             if self._registry.register(self._most):
                 return
             self._closing.wait(LOOK_S)
-        raise ServiceError(f"another instance is called '{self._name}'; stop it, or give this one another --port")
+        raise InputError(f"another instance is called '{self._name}'; stop it, or give this one another --port")
 
     def _run(self) -> None:
         is_gone = False

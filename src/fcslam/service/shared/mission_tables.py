@@ -5,7 +5,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fcslam.errors import ServiceError
+from fcslam.errors import InputError
 from fcslam.mission.mission_store import SCHEMA, TABLES, VERSION
 from fcslam.service.shared.schema import LOCK, schema_of
 from fcslam.storage.database import Database, translate_errors
@@ -13,7 +13,7 @@ from fcslam.storage.postgres import Postgres, PostgresTransaction
 from fcslam.storage.row_store import RowStore
 
 
-class LeaseLostError(ServiceError):
+class LeaseLostError(InputError):
     """Another worker has the mission."""
 
 

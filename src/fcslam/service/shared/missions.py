@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import ServiceError
+from fcslam.errors import InputError
 from fcslam.mission.mission_store import MissionStore
 from fcslam.service.intake import Intake, SessionState
 from fcslam.service.mission_folder import MissionFolder
@@ -210,7 +210,7 @@ class SharedMissions:
     def _open_first(self) -> None:
         try:
             self.create(FIRST)
-        except ServiceError:  # it is there, perhaps from another instance a moment ago
+        except InputError:  # it is there, perhaps from another instance a moment ago
             self.open(FIRST)
 
     def _known(self, name: str) -> KnownMission:

@@ -6,7 +6,7 @@ All times are of the server's clock, so a wrong clock of an instance does no har
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
-from fcslam.errors import ServiceError
+from fcslam.errors import InputError
 from fcslam.service.shared.mission_tables import Lease, MissionTables
 from fcslam.service.shared.schema import mission_statements, schema_of
 from fcslam.storage.postgres import Postgres
@@ -88,7 +88,7 @@ class Registry:
                 "INSERT INTO missions (name) VALUES (%s) ON CONFLICT DO NOTHING RETURNING number", (name,)
             ).fetchone()
             if new is None:
-                raise ServiceError(f"mission '{name}' exists; open it or choose another name")
+                raise InputError(f"mission '{name}' exists; open it or choose another name")
             number = int(new[0])
             connection.execute(mission_statements(number))
             connection.execute("COMMIT")

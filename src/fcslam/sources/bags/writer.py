@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fcslam.errors import OutputError
+from fcslam.errors import InputError
 from fcslam.records import (
     CameraImage,
     CameraModel,
@@ -68,7 +68,7 @@ def write_bag(path: Path, records: Iterable[SensorRecord]) -> None:
     follows from the odometry.
 
     Raises:
-        OutputError: the bag cannot be written, its kind is not known, or ROS has no such stamp.
+        InputError: the bag cannot be written, its kind is not known, or ROS has no such stamp.
     """
     from rosbags import rosbag1, rosbag2
 
@@ -77,7 +77,7 @@ def write_bag(path: Path, records: Iterable[SensorRecord]) -> None:
             for record in records:
                 bag.write(record)
     except (OSError, sqlite3.Error, rosbag1.WriterError, rosbag2.WriterError) as error:
-        raise OutputError(f"{path}: cannot be written ({error}); choose another path") from error
+        raise InputError(f"{path}: cannot be written ({error}); choose another path") from error
 
 
 @contextmanager
@@ -86,10 +86,10 @@ def _opened(path: Path) -> Iterator["_Bag"]:
     from rosbags import rosbag1, rosbag2
 
     if path.suffix not in BAG_SUFFIXES:
-        raise OutputError(f"{path}: not a kind of bag; end it in .bag, .mcap or .db3, or in nothing for a folder")
+        raise InputError(f"{path}: not a kind of bag; end it in .bag, .mcap or .db3, or in nothing for a folder")
     if path.suffix == _SQLITE and set("?#%") & set(str(path.absolute())):
         # rosbags puts the path into a URI as it is
-        raise OutputError(f"{path}: no .db3 can be written where a path holds ?, # or %; choose another path")
+        raise InputError(f"{path}: no .db3 can be written where a path holds ?, # or %; choose another path")
     with TemporaryDirectory(prefix=".", dir=path.parent) as staging:
         place = Path(staging, path.stem)
         if path.suffix == _ROS1:
@@ -154,7 +154,7 @@ class _Bag:
         try:
             encoding = _IMAGE_FORMATS[image_suffix(image.encoded)]
         except ValueError as error:
-            raise OutputError(f"an image at {image.stamp} s cannot be written ({error})") from error
+            raise InputError(f"an image at {image.stamp} s cannot be written ({error})") from error
         header = self._codec.header(stamp_ns, _CAMERA)
         self._mount(stamp_ns, _CAMERA, image.camera.T_base_camera)
         self._put(_CAMERA_INFO_TOPIC, CAMERA_INFO, self._camera_info(header, image.camera))
@@ -235,6 +235,6 @@ class _Bag:
 
 def _nanoseconds(stamp: float) -> int:
     if not 0.0 <= stamp < _END_OF_TIME_S:
-        raise OutputError(f"a bag has no stamp {stamp:.6f} s; ROS counts from 0 s to {_END_OF_TIME_S} s")
+        raise InputError(f"a bag has no stamp {stamp:.6f} s; ROS counts from 0 s to {_END_OF_TIME_S} s")
     seconds = int(stamp)
     return seconds * _NANOSECONDS + round((stamp - seconds) * _NANOSECONDS)
