@@ -16,7 +16,6 @@ from fcslam.lidar.frontend import LidarConfig
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.driving import side_by_side
 from fcslam.mission.mission import (
-    Live,
     MissionConfig,
     MissionInputs,
     Watch,
@@ -107,7 +106,6 @@ def run_recordings(
     inputs: MissionInputs,
     processes: int,
     watch: Watch,
-    live: Live = lambda _: None,
 ) -> Run:
     """Map opened recordings, ``processes`` robots at a time, after a check that none is there twice.
 
@@ -116,7 +114,7 @@ def run_recordings(
     """
     check_robots(recordings)
     sources.check_copies(recordings)
-    return run_mission(recordings, settings, watch, inputs, side_by_side(processes), live)
+    return run_mission(recordings, settings, watch, inputs, side_by_side(processes))
 
 
 def localize(

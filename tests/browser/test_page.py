@@ -297,7 +297,7 @@ def test_a_report_tells_of_days_of_changes_and_of_accuracy(browser, tmp_path):
     moved = {"kind": "moved", "start": [-1.0, 0.0], "end": [1.0, 0.0], "length_m": 2.0, "by_m": 0.3}
     plan = {"drawing": "M-2 -2L2 -2z", "maps": [{"map": 0, "aligned": True, "deviations": [moved]}]}
     (folder / "plan.json").write_text(json.dumps(plan))
-    with ShownRun(folder, "building") as shown:
+    with ShownRun(folder) as shown:
         (tmp_path / "report.html").write_text(report_html(shown))
     with (
         closing(browser.new_context(timezone_id="UTC", locale="en-GB")) as context,

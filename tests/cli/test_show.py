@@ -1,4 +1,4 @@
-"""`fcslam show` and `--live`: what is refused at once, the file, and the real commands."""
+"""`fcslam show`: what is refused at once, the file, and the real commands."""
 
 import os
 import re
@@ -6,9 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
-import time
-from contextlib import suppress
 
 import httpx
 import numpy as np
@@ -68,7 +65,6 @@ def test_a_port_in_use_is_told_in_one_line(run, capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         assert f":{port}" in refused(capsys, run, "--port", port)
-        assert main(["map", "x.clf", "--live", "--port", str(port), "-o", str(run.parent / "out")]) == 2
 
 
 def test_a_report_is_one_file_and_replaces_another_only_if_told(run, tmp_path, capsys):
@@ -134,27 +130,3 @@ def test_ctrl_c_ends_the_page_with_success_also_while_somebody_looks(run, end):
             assert events.status_code == 200
             command.process.send_signal(end)
             assert command.process.wait(120.0) == 0
-
-
-@pytest.mark.slow
-def test_a_page_beside_the_mapping_does_not_change_the_run(logs, tmp_path):
-    plain, live = tmp_path / "plain", tmp_path / "live"
-    assert main(["map", *map(str, logs[:2]), "-o", str(plain), "-q"]) == 0
-    shown = []
-
-    def watch(command):
-        while command.process.poll() is None:
-            with suppress(httpx.HTTPError):
-                shown.append(command.get(f"{API}/fleet").json()["read_only"])
-            time.sleep(0.05)
-
-    with Command("map", *logs[:2], "-o", live, "--live") as command:
-        watcher = threading.Thread(target=watch, args=(command,))
-        watcher.start()
-        command.process.communicate(timeout=120.0)
-        watcher.join()
-    assert command.process.returncode == 0, "without a terminal it does not wait"
-    assert shown
-    assert all(shown)
-    for file in sorted(path.relative_to(plain) for path in plain.rglob("*") if path.is_file()):
-        assert (live / file).read_bytes() == (plain / file).read_bytes(), file

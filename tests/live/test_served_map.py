@@ -45,7 +45,7 @@ def run_of(maps):
 @contextmanager
 def served(folder):
     """The address of a viewer of the run folder."""
-    with ShownRun(folder, "run") as shown, socket.create_server(("127.0.0.1", 0)) as listening:
+    with ShownRun(folder) as shown, socket.create_server(("127.0.0.1", 0)) as listening:
         server = uvicorn.Server(uvicorn.Config(viewer_app(ReadOnly(shown)), log_level="critical", ws="none"))
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()

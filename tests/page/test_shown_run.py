@@ -9,7 +9,6 @@ import json
 import re
 import shutil
 import subprocess
-from contextlib import aclosing
 from dataclasses import replace
 from html.parser import HTMLParser
 from zipfile import ZipFile
@@ -23,7 +22,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import InputError
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.mission.mission_file import as_stored, mission_bytes
-from fcslam.page import ASSETS, MODULES, viewer
+from fcslam.page import ASSETS, MODULES
 from fcslam.page.report import MOST_TILES, report_html
 from fcslam.page.shown_run import ShownRun
 from fcslam.page.viewer import ReadOnly, viewer_app
@@ -82,7 +81,7 @@ def run():
 @pytest.fixture
 def shown(run, tmp_path):
     run.save(tmp_path / "run")
-    with ShownRun(tmp_path / "run", "run") as shown:
+    with ShownRun(tmp_path / "run") as shown:
         yield shown
 
 
@@ -132,7 +131,7 @@ def test_every_route_of_viewers_answers_for_a_finished_run(shown):
 
 def test_a_run_without_a_mission_file_is_shown_too(run, tmp_path):
     replace(run, mission=b"").save(tmp_path / "run")
-    with ShownRun(tmp_path / "run", "run") as shown:
+    with ShownRun(tmp_path / "run") as shown:
         (robots,) = ask(shown, "/api/v1/robots")
     assert [(robot["session"], robot["packets"]) for robot in robots.json()] == [("a", 0), ("a+1", 0), ("b", 0)]
 
@@ -146,42 +145,6 @@ def test_nobody_changes_a_shown_run_or_reads_it_by_another_name_of_this_machine(
     (page,) = ask(shown, "/", host="attacker.example")
     assert page.status_code == 421
     assert {path: path.stat().st_mtime_ns for path in shown.run_folder.rglob("*")} == before
-
-
-def test_a_viewer_follows_a_link_to_the_newest_run(run, tmp_path):
-    link = tmp_path / "live"
-    with ShownRun(link, "live") as shown:
-        assert [answer.json() for answer in ask(shown, "/api/v1/robots", "/api/v1/maps")] == [[], []]
-        replace(run, mission=b"").save(tmp_path / "1")
-        link.symlink_to(tmp_path / "1")
-        assert shown.sessions("b") == [("b", 0, 0)]
-        run.save(tmp_path / "2")
-        link.unlink()
-        link.symlink_to(tmp_path / "2")
-        assert shown.sessions("a")[0] == ("a", 0, len(A))
-
-
-def test_a_run_that_is_mapped_again_is_told_and_shown(shown, run, monkeypatch):
-    monkeypatch.setattr(viewer, "LOOK_S", 0.01)
-    state = ReadOnly(shown)
-    tile = "/api/v1/maps/0/tiles/5/0/0.png"
-    before, sessions = ask(shown, tile)[0].content, shown.sessions()
-
-    async def replaced():
-        app = viewer_app(state)
-        async with app.router.lifespan_context(app):
-            await asyncio.sleep(0.1)
-            smaller = {name: t for name, t in run.trajectories.items() if name == "b"}
-            replace(run, trajectories=smaller, map_files=files("map", 20), mission=b"").save(
-                shown.run_folder, force=True
-            )
-            async with aclosing(state.events.watch()) as events:
-                return await anext(events)
-
-    assert asyncio.run(asyncio.wait_for(replaced(), 30.0)).kind == "live"
-    assert (shown.sessions(), shown.packet_counts().arrived) == ([("b", 0, 0)], 0)
-    assert ask(shown, tile)[0].content != before
-    assert len(sessions) == 3
 
 
 class Elements(HTMLParser):
@@ -240,7 +203,7 @@ def test_a_report_holds_all_that_the_page_asks_for_and_asks_nobody(shown):
 @pytest.mark.parametrize(("resolution_m", "zoom"), [(2.0, 0), (8.0, 0), (64.0, -1)])
 def test_a_report_of_a_huge_map_holds_coarse_tiles_or_none(run, tmp_path, resolution_m, zoom):
     replace(run, map_files=files("map", 400, resolution_m)).save(tmp_path / "run")
-    with ShownRun(tmp_path / "run", "run") as shown:
+    with ShownRun(tmp_path / "run") as shown:
         ((_, texts), _) = Elements(report_html(shown)).of("script")
     responses = json.loads(texts)
     assert json.loads(responses["texts"]["maps"])[0]["zoom"] == zoom
@@ -250,7 +213,7 @@ def test_a_report_of_a_huge_map_holds_coarse_tiles_or_none(run, tmp_path, resolu
 def test_a_report_of_what_cannot_be_shown_says_what(run, tmp_path):
     (closure,) = run.closures
     replace(run, closures=(replace(closure, T_i_j=np.full(3, np.nan)),)).save(tmp_path / "run")
-    with ShownRun(tmp_path / "run", "run") as shown, pytest.raises(InputError, match="closures"):
+    with ShownRun(tmp_path / "run") as shown, pytest.raises(InputError, match="closures"):
         report_html(shown)
 
 
@@ -274,7 +237,7 @@ def test_a_report_of_a_run_with_a_link_says_so(shown, tmp_path, name):
 
 def test_a_run_without_trajectories_has_no_archive_of_them(tmp_path):
     Run({}, metrics={"maps": Metric("maps", 0, "1")}).save(tmp_path / "run")
-    with ShownRun(tmp_path / "run", "run") as shown:
+    with ShownRun(tmp_path / "run") as shown:
         (answer,) = ask(shown, "/api/v1/trajectories.zip")
         assert (answer.status_code, answer.json()) == (404, {"error": "there are no trajectories"})
 

@@ -46,7 +46,7 @@ def run(tmp_path_factory):
     folder = write_run(tmp_path_factory.mktemp("runs") / "building", (0, 1))
     for name, content in {"plan": PLAN, "tags": TAGS, "quality": QUALITY}.items():
         (folder / f"{name}.json").write_text(json.dumps(content))
-    with ShownRun(folder, "building") as shown:
+    with ShownRun(folder) as shown:
         yield shown
 
 
@@ -58,7 +58,7 @@ def test_a_map_names_its_layers(run, tmp_path):
     assert {*layers_of(run, 0)} == {"plan", "tags", "quality", "changes"}
     assert map_summaries(run)[0].layers == layers_of(run, 0)
     write_run(tmp_path / "one-day", (0,))
-    with ShownRun(tmp_path / "one-day", "one-day") as shown:
+    with ShownRun(tmp_path / "one-day") as shown:
         assert layers_of(shown, 0) == []
         assert map_shapes(shown, 0, MapLayer.CHANGES) == []
 
@@ -97,7 +97,7 @@ def reads(monkeypatch):
 
 
 def test_packets_are_read_once_for_all_who_ask_for_changes(tmp_path, reads):
-    with ShownRun(write_run(tmp_path / "asked", (0, 1)), "asked") as shown:
+    with ShownRun(write_run(tmp_path / "asked", (0, 1))) as shown:
         first, second = (map_shapes(shown, 0, MapLayer.CHANGES) for _ in range(2))
     assert first == second != []
     assert len(reads) == 1
@@ -105,7 +105,7 @@ def test_packets_are_read_once_for_all_who_ask_for_changes(tmp_path, reads):
 
 @pytest.mark.attack
 def test_packets_that_expand_too_much_are_not_decoded_and_read_once(tmp_path, reads, monkeypatch):
-    with ShownRun(write_run(tmp_path / "bomb", (0, 1)), "bomb") as shown:
+    with ShownRun(write_run(tmp_path / "bomb", (0, 1))) as shown:
         monkeypatch.setattr(untrusted, "FREE_BYTES", -(10**12))
         for _ in range(2):
             with pytest.raises(InputError, match="limit"):
@@ -123,11 +123,11 @@ def test_a_trajectory_without_poses_is_no_session_of_a_map(tmp_path):
     folder = write_run(tmp_path / "empty", (0, 1))
     first, second = (folder / "trajectories" / f"{name}.tum" for name in ("anna", "anna+1"))
     second.write_text("")
-    with ShownRun(folder, "empty") as shown:
+    with ShownRun(folder) as shown:
         assert layers_of(shown, 0) == map_shapes(shown, 0, MapLayer.CHANGES) == []
         assert [session.map for session in all_sessions(shown)] == [0, None]
     first.write_text("")
-    with ShownRun(folder, "empty") as shown:
+    with ShownRun(folder) as shown:
         assert map_shapes(shown, 0, MapLayer.CHANGES) == []
 
 
@@ -147,7 +147,7 @@ def test_a_broken_file_is_named(tmp_path, monkeypatch, content):
     (folder / "plan.json").write_text(content)
     if content.isspace():
         monkeypatch.setattr(map_layers, "MOST_LAYER_BYTES", 4000)
-    with ShownRun(folder, "broken") as shown, pytest.raises(InputError, match=r"plan\.json"):
+    with ShownRun(folder) as shown, pytest.raises(InputError, match=r"plan\.json"):
         map_shapes(shown, 0, MapLayer.PLAN)
 
 
@@ -155,7 +155,7 @@ def test_a_file_that_is_a_link_is_not_followed(tmp_path):
     folder = write_run(tmp_path / "linked", (0,))
     (tmp_path / "other.json").write_text(json.dumps(TAGS))
     (folder / "tags.json").symlink_to(tmp_path / "other.json")
-    with ShownRun(folder, "linked") as shown, pytest.raises(InputError, match=r"tags\.json"):
+    with ShownRun(folder) as shown, pytest.raises(InputError, match=r"tags\.json"):
         map_shapes(shown, 0, MapLayer.TAGS)
 
 

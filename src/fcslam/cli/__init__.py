@@ -103,7 +103,6 @@ COMMANDS: dict[str, tuple[str, Callable[..., None] | typer.Typer]] = {
 EXAMPLES = """\
 fcslam map robot1.clf.gz robot2.clf.gz
 fcslam map anna=run1.bag ben=run2.mcap -o runs/building
-fcslam map robot1.bag robot2.bag --live
 fcslam map today.bag --onto runs/building -o runs/building-2
 fcslam map --onto runs/building -o runs/building-edited
 fcslam info robot1.mcap --json

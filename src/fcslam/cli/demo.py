@@ -2,15 +2,13 @@
 
 import shutil
 import time
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from fcslam.cli.options import BuildingSeed, Live, NoCamera, PathLength, Quiet
+from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, Quiet
 from fcslam.cli.output import notices, print_line
-from fcslam.cli.show import live_page
 from fcslam.errors import InputError
 from fcslam.lab.simulation.options import Scanner
 
@@ -28,7 +26,6 @@ def demo(
     seed: BuildingSeed = 1,
     path_length: PathLength = None,
     no_camera: NoCamera = False,
-    live: Live = False,
     quiet: Quiet = False,
 ) -> None:
     """Simulate robots with unknown starts, map them, and compare the map with the truth."""
@@ -66,13 +63,12 @@ def demo(
     recordings = record_fleet(fleet, output / RECORDINGS, console)
     sources = [open_source(place) for place in recordings]
     begin(2, "map each robot, recognise places, fuse the maps")
-    with live_page(output / RUN) if live else nullcontext() as page:
-        map_sources(sources, MissionConfig(seed=seed), MissionInputs(), output / RUN, console, force=True, page=page)
-        begin(3, "evaluate: compare with the truth")
-        report_fleet(output / RUN, output / RECORDINGS, output / TABLE, console)
-        typer.echo(f"{time.perf_counter() - began:.0f} s in all")
-        for content, name in (("run folder", RUN), ("map", f"{RUN}/map.png"), ("all numbers", TABLE)):
-            typer.echo(f"{content}: {output / name}")
+    map_sources(sources, MissionConfig(seed=seed), MissionInputs(), output / RUN, console, force=True)
+    begin(3, "evaluate: compare with the truth")
+    report_fleet(output / RUN, output / RECORDINGS, output / TABLE, console)
+    typer.echo(f"{time.perf_counter() - began:.0f} s in all")
+    for content, name in (("run folder", RUN), ("map", f"{RUN}/map.png"), ("all numbers", TABLE)):
+        typer.echo(f"{content}: {output / name}")
 
 
 def _prepare(output: Path) -> None:

@@ -5,7 +5,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +15,6 @@ from fcslam.cli.inputs import bag_options, named_path, print_faults, print_notes
 from fcslam.cli.options import (
     ConfigFiles,
     Force,
-    Live,
     Quiet,
     Sensors,
     WorkersOption,
@@ -24,7 +23,6 @@ from fcslam.cli.options import (
     with_starts,
 )
 from fcslam.cli.output import RUNS, answers, new_folder, notices
-from fcslam.cli.show import live_page
 from fcslam.cli.warm_up import compiled, cores
 from fcslam.errors import InputError
 
@@ -34,7 +32,6 @@ if TYPE_CHECKING:
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.mission.mission import MissionConfig, MissionInputs, Progress
     from fcslam.mission.mission_file import SavedMission
-    from fcslam.page.live_map import LiveMap
     from fcslam.runs import RobotTrajectory, Run
     from fcslam.sources import Source
     from fcslam.sources.faults import Faults
@@ -98,7 +95,6 @@ def map_recordings(
         ),
     ] = None,
     sensors: Sensors = None,
-    live: Live = False,
     force: Force = False,
     quiet: Quiet = False,
     workers: WorkersOption = "1",
@@ -128,9 +124,9 @@ def map_recordings(
             ]
         sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
-    with verifying(workers) as verify, live_page(output) if live else nullcontext() as page:
+    with verifying(workers) as verify:
         inputs = MissionInputs(earlier, floors=floors, anchors=anchors, verify_pairs=verify)
-        map_sources(sources, settings, inputs, output, notices(quiet), force, page)
+        map_sources(sources, settings, inputs, output, notices(quiet), force)
 
 
 def floors_of(options: "Sequence[str]", robots: "Sequence[str]") -> dict[str, str]:
@@ -150,7 +146,6 @@ def map_sources(
     output: Path,
     console: "Console",
     force: bool = False,
-    page: "LiveMap | None" = None,
 ) -> "Run":
     """Run the mission, write the run folder and print a summary; progress and notices go to ``console``.
 
@@ -169,12 +164,9 @@ def map_sources(
         faults: dict[str, Faults] = {}
         known = sum(len(track.stamps) for track in inputs.onto.tracks.values())
         progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
-        look = (lambda _: None) if page is None else page.look
-        run = run_recordings(sources, settings, inputs, cores(), progress, look)
+        run = run_recordings(sources, settings, inputs, cores(), progress)
         display.start("writing")
         run.save(output, force)
-    if page is not None:
-        page.finish(output)
     print_faults(console, faults)
     _report(run, time.perf_counter() - began, output, settings, inputs.onto)
     return run

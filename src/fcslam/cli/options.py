@@ -75,7 +75,6 @@ RosParameters = Annotated[
 UseSimTime = Annotated[
     bool, typer.Option("--use-sim-time", help="Take the time from /clock, as with a simulator.", rich_help_panel=_ROS)
 ]
-Live = Annotated[bool, typer.Option("--live", help="Show the map on a page while it grows, and after that the run.")]
 
 Floor = Annotated[str, typer.Option(help="Floor of the building. Places of different floors are never compared.")]
 ServerUrl = Annotated[

@@ -1,23 +1,16 @@
 """`fcslam show`: the page of `fcslam serve` on a finished run, or as one file."""
 
 import os
-import signal
 import sys
 import webbrowser
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
-from socket import socket
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from fcslam.cli.listening import listen
 from fcslam.cli.options import Force
 from fcslam.errors import InputError
-
-if TYPE_CHECKING:
-    from fcslam.page.live_map import LiveMap
 
 LARGEST_BYTES = 2 * 2**30
 """Largest total size of the files of a run folder: the page's server holds most of them in memory."""
@@ -49,7 +42,7 @@ def show(
     if html is not None and html.exists() and not (force and html.is_file()):
         raise InputError(f"{html}: exists; name a new file, or give --force to replace it")
     _check(run)
-    with ShownRun(run, run.resolve().name) as shown:
+    with ShownRun(run) as shown:
         if html is not None:
             content = report_html(shown).encode()
             try:
@@ -61,8 +54,11 @@ def show(
         from fcslam.page.viewer import ReadOnly, run_viewer, viewer_app
 
         with listen(HOST, port) as listening:
-            _announce(f"fcslam shows {run}", listening, open_browser)
-            typer.echo("Ctrl-C ends it")
+            address = f"http://{HOST}:{listening.getsockname()[1]}/"
+            typer.echo(f"fcslam shows {run} at {address}\nCtrl-C ends it")
+            has_display = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+            if open_browser or (open_browser is None and has_display):
+                webbrowser.open(address)
             run_viewer(viewer_app(ReadOnly(shown)), listening)
 
 
@@ -77,27 +73,3 @@ def _check(run: Path) -> None:
             f"{run}: the files have {size / 2**30:.1f} GiB; fcslam show reads at most {LARGEST_BYTES / 2**30:.0f} GiB"
         )
     _ = open_run(run).maps
-
-
-@contextmanager
-def live_page(run: Path) -> "Iterator[LiveMap]":
-    """Serve the page of a run while it is mapped, and in the end until Ctrl-C if there is a terminal for that."""
-    from fcslam.page import live_map
-
-    with listen(HOST, 0) as listening, live_map.live_page(listening, run.name) as live:
-        _announce(f"fcslam shows the map of {run} while it grows", listening, None)
-        yield live
-        if sys.stdin.isatty():
-            typer.echo("The page shows the finished run; Ctrl-C ends it")
-            with suppress(KeyboardInterrupt):
-                signal.pause()
-
-
-def _announce(what: str, listening: socket, open_browser: bool | None) -> None:
-    address = f"http://{HOST}:{listening.getsockname()[1]}/"
-    typer.echo(f"{what} at {address}")
-    if open_browser is None:
-        has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        open_browser = sys.platform == "darwin" or bool(has_display)
-    if open_browser:
-        webbrowser.open(address)

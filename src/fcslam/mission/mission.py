@@ -179,15 +179,6 @@ class MissionCloud:
             self._traffic.accept(packet.label, packet.size)
         return replies
 
-    def run_so_far(self) -> Run:
-        """The map so far, as the service shows it live: without new decisions, and of the keyscans alone."""
-        result = self.host.fleet.estimate()
-        tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
-        metrics = traffic_metrics(self._traffic, tracks)
-        return run_of(
-            result, tracks, metrics, dump(self.config), self.config.map, with_local_maps=False, with_certificates=False
-        )
-
     def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
         """The result of all packets so far.
 

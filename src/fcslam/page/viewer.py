@@ -1,11 +1,8 @@
 """The page over a run that nobody can change: the routes of viewers alone, for this machine, without tokens."""
 
-import asyncio
-import itertools
 import signal
 import socket
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import uvicorn
@@ -14,7 +11,6 @@ from fastapi.params import Depends as Dependency
 
 import fcslam
 from fcslam.page.routes import page_router, report_router
-from fcslam.runs.folder import identity
 from fcslam.service.http.app import PREFIX, VIEWER_ROUTERS
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.events import EventStream
@@ -22,8 +18,6 @@ from fcslam.service.http.middleware import LocalNames
 from fcslam.service.http.problems import add_handlers
 from fcslam.service.viewed_mission import ViewedMission
 
-LOOK_S = 0.2
-"""Between two looks for a new run folder."""
 LAST_ANSWERS_S = 1
 """Time for requests in progress when the viewer ends."""
 
@@ -47,17 +41,8 @@ class ReadOnly:
 
 
 def viewer_app(state: ReadOnly) -> FastAPI:
-    """The page and what it asks; while it runs, its events follow the run folder."""
-
-    @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        following = asyncio.create_task(_follow(state))
-        yield
-        following.cancel()
-
-    app = FastAPI(
-        title="fcslam", version=fcslam.__version__, openapi_url=None, redirect_slashes=False, lifespan=lifespan
-    )
+    """The page and what it asks."""
+    app = FastAPI(title="fcslam", version=fcslam.__version__, openapi_url=None, redirect_slashes=False)
     add_handlers(app)
     for make in VIEWER_ROUTERS:
         app.include_router(make(state), prefix=PREFIX)
@@ -65,22 +50,6 @@ def viewer_app(state: ReadOnly) -> FastAPI:
     app.include_router(report_router(state))
     app.add_middleware(LocalNames)
     return app
-
-
-async def _follow(state: ReadOnly) -> None:
-    shown = _newest(state)
-    for number in itertools.count(1):
-        while shown == (newest := _newest(state)):
-            await asyncio.sleep(LOOK_S)
-        shown = newest
-        state.events.publish("live", number)
-
-
-def _newest(state: ReadOnly) -> tuple[int, int] | None:
-    folder = state.mission.run_folder
-    with suppress(FileNotFoundError):  # another one is about to replace it
-        return None if folder is None else identity(folder)
-    return None
 
 
 def run_viewer(app: FastAPI, listening: socket.socket) -> None:

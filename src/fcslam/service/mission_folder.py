@@ -50,14 +50,10 @@ class MissionFolder:
         before = int(self.live.resolve().name) if self.live.exists() else 0
         name = str(before + 1)
         run.save(snapshots / name, force=True)
-        self.make_live(Path("snapshots") / name)
+        link = self.path / ".live.partial"
+        link.unlink(missing_ok=True)
+        link.symlink_to(Path("snapshots") / name, target_is_directory=True)
+        os.replace(link, self.live)
         for old in snapshots.iterdir():
             if old.name not in (str(before), name):
                 shutil.rmtree(old, ignore_errors=True)
-
-    def make_live(self, run_folder: Path) -> None:
-        """Make a run folder the live one; its path is relative to this folder, or absolute."""
-        link = self.path / ".live.partial"
-        link.unlink(missing_ok=True)
-        link.symlink_to(run_folder, target_is_directory=True)
-        os.replace(link, self.live)
