@@ -10,7 +10,7 @@ line is untrue. Where a recording is corrected, its path is tracked as it is and
 positions at all scans after a rigid alignment.
 
 The faulty recordings are 11 of these, changed: the laser sees the floor in a line 2 m ahead, it is turned by 90
-degrees or upside down against tf, its ranges are 0.3 m too long or in feet, or its clock is behind by 0.25 s. Further
+degrees or upside down against tf, or its clock is behind by 0.25 s. Further
 faults are in `recordings.py`. `--drives` names the folder of the bags; it is filled if they are missing. The recorded
 logs have no truth, so their lines are listed.
 """
@@ -29,7 +29,7 @@ from worlds import floor_worlds
 
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
-from fcslam.lidar.facing import MOST_COMPARED, contradicted_facing, excess_of
+from fcslam.lidar.facing import MOST_COMPARED, contradicted_facing
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.lidar.leaning import floor_line
 from fcslam.metrics.trajectory import align, interpolate
@@ -46,7 +46,6 @@ SCANNERS = ("rplidar", "sick", "short")
 SEEDS = (1, 2, 3, 4, 5)
 ROBOT = "anna"
 KINDS = {
-    "ranges that are too long": "are bent|the ranges are too",
     "a leaning laser": "sees the floor",
     "facing": "contradict the odometry|turn against the odometry|of one robot",
     "scale of distances": "the robot's distance is",
@@ -65,7 +64,7 @@ LOGS = {
 }  # fmt: skip
 CORRECTED = "used", "corrected", "left out"
 """Ends of the lines about a recording that is read otherwise."""
-FLOOR_M, FEET_M, LATE_S, EXCESS_M = 2.0, 0.3048, 0.25, 0.3
+FLOOR_M, LATE_S = 2.0, 0.25
 
 
 def main() -> None:
@@ -197,15 +196,6 @@ def upside_down(scan: LaserScan) -> LaserScan:
     return replace(scan, laser=mirrored)
 
 
-def in_feet(scan: LaserScan) -> LaserScan:
-    laser = replace(scan.laser, max_range_m=scan.laser.max_range_m / FEET_M)
-    return replace(scan, laser=laser, ranges_m=frozen(scan.ranges_m / FEET_M, np.float32))
-
-
-def longer(scan: LaserScan) -> LaserScan:
-    return replace(scan, ranges_m=frozen(scan.ranges_m + EXCESS_M, np.float32))
-
-
 def is_found_turned(_: RosBag, scans: list[LaserScan]) -> bool:
     found = contradicted_facing(turned(scan, -math.pi / 2) for scan in scans)
     return found is not None and round(found.facing.turned_deg) == 90
@@ -226,8 +216,6 @@ FAULTS: dict[str, Callable[[RosBag, list[LaserScan]], bool]] = {
     "sees the floor": lambda _, scans: floor_line(list(floor_ahead(scans))) is not None,
     "turned by 90 deg": is_found_turned,
     "upside down": is_found_upside_down,
-    "0.3 m too long": lambda _, scans: excess_of(map(longer, scans)) is not None,
-    "feet": lambda _, scans: contradicted_facing(map(in_feet, scans)) is not None,
     "another clock": is_found_late,
 }
 

@@ -15,6 +15,7 @@ from fcslam.records import LaserModel, frozen
 from fcslam.robot.calibrating import calibrated
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source, write_bag
+from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.returns import FloorLine
 from tests.carmen_logs import write_carmen
 from tests.lidar import worlds
@@ -125,7 +126,7 @@ def test_a_bag_is_mapped_without_the_floor(tmp_path, upside_down):
     write_bag(path, with_floor(FloorLine(2.0, 0.4)))
     bag = open_source(path)
     if upside_down:  # as tf says; the scans tell that it is not
-        bag = bag.corrected(replace(bag._options.correction, upside_down=True), ())
+        bag = bag.corrected(BagCorrection(upside_down=True), ())
     source = calibrated(bag, LidarConfig())
     said = [note for note in source.survey().notes if "sees the floor" in note]
     assert len(said) == 1

@@ -124,7 +124,7 @@ def outcome(path, options=None):
 
 
 MILLIMETRES, INCHES = "they seem to be millimetres", "inches: by 39.37"
-WRONG = (MILLIMETRES, INCHES, "seem to be feet", "the robot's distance is 0.5", "span 3")
+WRONG = (MILLIMETRES, INCHES, "may be feet", "the robot's distance is 0.5", "span 3")
 """Lines about ranges and angles that are not corrected."""
 SLOW, FAST = 0.2 * 359 / 360, 0.1 * 359 / 360
 WIDE = {"beams": 811, "first_rad": math.radians(-135.0), "step_deg": 1.0 / 3.0}
@@ -200,7 +200,7 @@ SCANNERS = {
     "a microcontroller, millimetres": Scanner(unit=1000.0, range_max=12000.0, shortest_m=100.0, line=MILLIMETRES),
     "a microcontroller, millimetres with limits in metres": Scanner(unit=1000.0, grid_m=0.001, line=MILLIMETRES),
     "inches": Scanner(unit=39.37, range_max=12.0 * 39.37, line=INCHES),
-    "feet": Scanner(unit=1.0 / 0.3048, range_max=40.0, line="seem to be feet"),
+    "feet": Scanner(unit=1.0 / 0.3048, range_max=40.0, line="may be feet"),
     "a counter of half the time of flight": Scanner(unit=0.5, line="the robot's distance is 0.5"),
     "a turn stated as 270 deg": Scanner(bent=0.75, line="span 3"),
 }

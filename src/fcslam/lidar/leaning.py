@@ -16,13 +16,13 @@ from typing import Final
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.lidar.facing import Contradiction, Excess, contradicted_facing, excess_of, part_agreement
-from fcslam.lidar.own_body import NOTHING_M, by_degree, scans_apart
+from fcslam.lidar.facing import SCANS_WATCHED, Contradiction, contradicted_facing, part_agreement
+from fcslam.lidar.own_body import MOST_PLACES, NOTHING_M, by_degree, scans_apart
 from fcslam.lidar.scan import rays_of
 from fcslam.records import FloatArray, LaserScan, frozen
 from fcslam.sources.returns import FloorLine
 
-FEWEST_PLACES, MOST_PLACES = 60, 400
+FEWEST_PLACES: Final = SCANS_WATCHED
 HALF_DEG: Final = 35
 """Half of the sector that must see the line; a circle differs from a line by a fifth there."""
 STEP_DEG: Final = 5
@@ -35,16 +35,16 @@ SAME: Final = 0.06
 """Largest deviation from the line, as a share of its distance: robots nod."""
 LEAST_STRAIGHT, LEAST_AT, MOST_BEYOND = 0.9, 0.12, 0.02
 """Shares: of the degrees that end at the line, of the returns there, and of those farther than ``BEYOND`` of it."""
-BEYOND: Final = 1.1
+BEYOND: Final = 1.0 + 2.0 * SAME
 LEAST_M: Final = 1.0
 """What is nearer is the robot's body."""
 MOVING: Final = 0.3
 """Largest agreement of a line that moves with the robot; a wall keeps its place, also in a lane or a round building."""
 
 
-def wrong_laser(scans: Sequence[LaserScan]) -> FloorLine | Contradiction | Excess | None:
-    """What is wrong with how a laser is mounted or measures, by the scans of a ``FacingWatch``."""
-    return floor_line(scans) or contradicted_facing(scans) or excess_of(scans)
+def wrong_laser(scans: Sequence[LaserScan]) -> FloorLine | Contradiction | None:
+    """What is wrong with how a laser is mounted, by the scans of a ``FacingWatch``."""
+    return floor_line(scans) or contradicted_facing(scans)
 
 
 def floor_line(scans: Sequence[LaserScan]) -> FloorLine | None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from fcslam.geometry import se2
+from fcslam.lidar import calibration
 from fcslam.records import FloatArray, LaserModel, LaserScan
 from fcslam.sources.point_clouds import LARGEST_BODY_M
 
@@ -53,7 +54,7 @@ Polygon = Annotated[
 ]
 """Corners in the order of the outline; empty: none."""
 
-LEAST_MOVE_M, LEAST_TURN_RAD = 0.3, 0.3
+LEAST_MOVE_M, LEAST_TURN_RAD = 2.0 * calibration.LEAST_MOVE_M, 2.0 * calibration.LEAST_TURN_RAD
 """The robot has moved or turned by so much between two scans that are compared."""
 FEWEST_PLACES, MOST_PLACES = 20, 200
 NOTHING_M: Final = 1e3

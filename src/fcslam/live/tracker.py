@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fcslam.errors import InputError
-from fcslam.lidar.facing import Contradiction, Excess, FacingWatch
+from fcslam.lidar.facing import Contradiction, FacingWatch
 from fcslam.lidar.leaning import wrong_laser
 from fcslam.live.inputs import Lasers, checked_lasers, checked_robot, checked_scan, checked_stamp
 from fcslam.live.records import EventKind, RobotEvent, RobotPose
@@ -69,7 +69,7 @@ class LiveTracker(ABC):
         self._is_finished = False
         self._facing: defaultdict[tuple[float, float, float], FacingWatch] = defaultdict(FacingWatch)
         """By the mounting of a laser."""
-        self._examined: deque[Future[FloorLine | Contradiction | Excess | None]] = deque()
+        self._examined: deque[Future[FloorLine | Contradiction | None]] = deque()
         """What the worker finds wrong with each laser: it takes as long as hundreds of scans."""
         self._told: set[str] = set()
         """Failures that were reported."""

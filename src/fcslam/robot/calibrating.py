@@ -11,16 +11,7 @@ import numpy as np
 from fcslam.geometry import se2
 from fcslam.geometry.beams import is_same_laser
 from fcslam.lidar.calibration import Estimate, MotionCalibration, OdometryTrack, ScanMotions, calibrate
-from fcslam.lidar.facing import (
-    LARGEST_WHEEL_SCALE,
-    MOST_COMPARED,
-    Contradiction,
-    Excess,
-    contradicted_facing,
-    distance_remedy,
-    excess_of,
-    turn_remedy,
-)
+from fcslam.lidar.facing import AS_STATED, MOST_COMPARED, Contradiction, contradicted_facing
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.leaning import floor_line
 from fcslam.lidar.own_body import body_sectors
@@ -39,6 +30,10 @@ MOST_SCANS: Final = 1200
 """Scans that are tracked at most."""
 ENOUGH_TURN_RAD: Final = 40.0
 """Turns, all together, after which no more scans are tracked."""
+LARGEST_WHEEL_SCALE: Final = 1.5
+"""Distances that differ by a larger factor may be due to the unit of the ranges."""
+LARGEST_SPAN_DEG: Final = 400.0
+"""No beams span more than a turn, with the error of an estimate."""
 LARGEST_SCALE: Final = 2.0
 """Odometry that turns more or less than the scans by a larger factor measures something else."""
 LONGEST_PERIOD_S: Final = 0.12
@@ -91,22 +86,18 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
 def _calibrate_level(bag: RosBag, config: LidarConfig, contradictions: "list[_Found]") -> Calibrated:
     if len(contradictions) > 1:
         named = zip(bag.plan.lasers, contradictions, strict=True)
-        said = ((laser.name, found.facing or found.excess) for laser, found in named)
-        lines = tuple(f"{laser}: {line}; not corrected" for laser, line in said if line is not None)
+        lines = tuple(f"{laser.name}: {found.facing}; not corrected" for laser, found in named if found.facing)
         return Calibrated(MotionCalibration(), BagCorrection(), lines)
-    found, excess, _ = contradictions[0]
+    found = contradictions[0].facing
     if found is None:
+        return _calibrate_finely(bag, config)
+    if found.facing == AS_STATED:
         fine = _calibrate_finely(bag, config)
-        if excess is None or _is_wrong(fine.calibration.distance_scale):
-            return fine
-        return Calibrated(fine.calibration, BagCorrection(), (f"{excess}; not corrected",))
-    turned_deg, upside_down, distance, _ = found.facing
-    if not found.is_correctable:
-        fine = _calibrate_finely(bag, config)
-        scale = fine.calibration.turn_scale if distance == 1.0 else fine.calibration.distance_scale
-        is_explained = _is_wrong(scale) or fine.correction.odometry_delay_s != 0.0  # by its scale, or another clock
+        scales = fine.calibration.turn_scale, fine.calibration.distance_scale
+        is_explained = any(map(_is_wrong, scales)) or fine.correction.odometry_delay_s != 0.0  # another clock
         lines_before = () if is_explained else (f"{found}; not corrected",)
         return replace(fine, lines=(*lines_before, *fine.lines))
+    turned_deg, upside_down = found.facing
     T_base_laser = np.array(bag.survey().lasers[0].T_base_laser)
     turned = se2.compose(T_base_laser, (0.0, 0.0, math.radians(turned_deg)))
     x, y, theta = se2.compose(turned, se2.inverse(T_base_laser)).tolist()
@@ -125,8 +116,6 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
     for laser, found in zip(source.survey().lasers, _contradictions(source), strict=True):
         if found.facing is not None:
             lines.append(say(found.facing))
-        if found.excess is not None:
-            lines.append(str(found.excess))
         if found.floor is not None:
             middle_deg = round(math.degrees(se2.wrap_angle(found.floor.heading_rad + laser.T_base_laser[2])))
             ignored = [middle_deg - FLOOR_HALF_DEG, middle_deg + FLOOR_HALF_DEG]
@@ -167,8 +156,6 @@ class _Found(NamedTuple):
     """What speaks against the scans of a laser."""
 
     facing: Contradiction | None
-    excess: Excess | None
-    """Unless the laser faces another way."""
     floor: FloorLine | None
 
 
@@ -176,8 +163,7 @@ def _contradictions(source: Source) -> list[_Found]:
     found = []
     for laser in source.survey().lasers:
         first = list(islice(_scans_of(laser, source), MOST_COMPARED))
-        facing = contradicted_facing(first)
-        found.append(_Found(facing, excess_of(first) if facing is None else None, floor_line(first)))
+        found.append(_Found(contradicted_facing(first), floor_line(first)))
     return found
 
 
@@ -223,9 +209,21 @@ def _is_wrong(scale: Estimate | None) -> TypeGuard[Estimate]:
 def _scale_lines(calibration: MotionCalibration, beams: Beams) -> Iterator[str]:
     distance, turn = calibration.distance_scale, calibration.turn_scale
     if _is_wrong(distance):
-        yield _scale_line("distance", distance, distance_remedy(distance.value))
+        is_wheel = 1.0 / LARGEST_WHEEL_SCALE < distance.value < LARGEST_WHEEL_SCALE
+        unit = "" if is_wheel else ", or the unit of the ranges, which may be feet"
+        yield _scale_line("distance", distance, f"correct the radius of the wheels in its driver{unit}")
     if _is_wrong(turn):
-        yield _scale_line("turn", turn, turn_remedy(turn.value, beams))
+        yield _scale_line("turn", turn, _turn_remedy(turn.value, beams))
+
+
+def _turn_remedy(turn: float, beams: Beams) -> str:
+    """What to do about a robot whose turn by scans is ``turn`` of that by odometry."""
+    wheels = "correct the distance of the wheels in its driver"
+    stated_deg = math.degrees(beams.span_rad + beams.angle_increment_rad)
+    span_deg = stated_deg / turn
+    if span_deg > LARGEST_SPAN_DEG:
+        return wheels
+    return f"{wheels}, or the angles of the beams, which then span {span_deg:.0f} deg and not {stated_deg:.0f}"
 
 
 def _scale_line(name: str, scale: Estimate, remedy: str) -> str:
@@ -246,7 +244,7 @@ def _contradiction(scale: Estimate, beams: Beams) -> tuple[str, ...]:
         f"the turns of the scans are {scale.value:.2f} (+- {scale.sigma:.2f}) of what odometry says: they are not of "
         "one robot, or one of both is broken; not corrected: choose the topics by --sensors scan-topic and odom-topic, "
         "or "
-        f"{turn_remedy(scale.value, beams)}",
+        f"{_turn_remedy(scale.value, beams)}",
     )
 
 
