@@ -85,7 +85,7 @@ def test_files_that_are_no_configuration(tmp_path, content):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("content", ["seed: 1\nseed: 2\n", "robot:\n  sends: words\nrobot:\n  sends: descriptors\n"])
+@pytest.mark.parametrize("content", ["seed: 1\nseed: 2\n", "robot:\n  channels: [lidar]\nrobot: {}\n"])
 def test_a_key_that_is_there_twice_is_refused(tmp_path, content):
     path = tmp_path / "c.yaml"
     path.write_text(content)

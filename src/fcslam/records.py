@@ -401,38 +401,6 @@ class Place:
     """Shape (N, 32)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class WordPlace:
-    """A place of a robot that sends words: of each descriptor, only its word in an agreed vocabulary."""
-
-    id: KeyscanId
-    channel: Channel
-    detector_version: str
-    first: int
-    """Number of the first keyscan of its submap."""
-    last: int
-    """Number of the last keyscan of its submap (inclusive)."""
-    keypoints: NDArray[np.float32]
-    """As of a ``Place``."""
-    words: NDArray[np.uint16]
-    """Shape (N,)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapTile:
-    """A square of the map that a robot made of its own measurements."""
-
-    robot: str
-    resolution_m: float
-    """Side of a cell."""
-    column: int
-    """Number of the tile along x; tile 0 begins at the origin of the robot's own map, its first keyscan."""
-    row: int
-    """The same along y."""
-    cells: NDArray[np.uint8]
-    """``Occupancy`` of every cell, shape (256, 256). Rows run along y and columns along x, from the lowest value up."""
-
-
 @dataclass(frozen=True, slots=True)
 class DetectorFile:
     """Description of a network file that robots can download."""

@@ -1,11 +1,9 @@
 """Missions of one service: begun, opened, brought in, whatever the disk says."""
 
-import os
-
 import pytest
 
-from fcslam.cloud.settings import CloudConfig, FleetConfig
-from fcslam.errors import InputError, StoreError
+from fcslam.cloud.settings import CloudConfig
+from fcslam.errors import StoreError
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import Missions
 
@@ -82,20 +80,6 @@ def test_a_mission_without_its_file_is_not_a_new_one(service, harm):
     with pytest.raises(StoreError, match="is missing or empty; put its backup in its place"):
         missions._opened("mission")
     assert missions.open_mission.folder.name == "next"
-
-
-@pytest.mark.parametrize("kind", ["missing", "pipe", "folder"])
-def test_a_mission_whose_vocabulary_is_no_file_is_refused_by_name(tmp_path, kind):
-    path = tmp_path / "building.words"
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "folder":
-        path.mkdir()
-    launched = []
-    config = CloudConfig(fleet=FleetConfig(vocabularies=(path,)))
-    with pytest.raises(InputError, match=r"mission 'mission': .*building\.words"):
-        Missions(tmp_path / "data", config, lambda: 0.0, lambda: 1e9, launched.append)
-    assert launched == []
 
 
 def test_what_was_left_half_done_is_swept_away_and_the_rest_is_not(tmp_path):

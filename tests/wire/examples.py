@@ -17,13 +17,11 @@ from fcslam.records import (
     KeyscanFix,
     KeyscanId,
     LaserModel,
-    MapTile,
     Place,
     Sweep,
     Tag,
     TagFamily,
     TagSighting,
-    WordPlace,
     frozen,
 )
 from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
@@ -42,13 +40,11 @@ HELLO = Hello(
     {Channel.LIDAR: "orb-1", Channel.CAMERA: "cnn-0.3+r12"},
 )
 FLOOR_HELLO = replace(HELLO, floor="-1")
-WORDS_HELLO = replace(FLOOR_HELLO, vocabularies={Channel.CAMERA: bytes(range(32, 64))})
 KEYSCAN = Keyscan(
     KeyscanId("alice", 12),
     1042.25,
     dequantise(np.array([0, 1, 500, 501, 501, 499, 65535, 0, 0, 1000, 999, 998, 997, 996], np.uint16)),
 )
-BARE_KEYSCAN = replace(KEYSCAN, ranges_m=frozen([], np.float32))
 VARIED_KEYSCAN = replace(KEYSCAN, laser=1, beams=Beams(14, -1.25, 0.0078125))
 SWEPT_KEYSCAN = replace(KEYSCAN, sweep=Sweep(0.0, 0.14, (0.512, -0.003, 1.25), (0.25, 0.0, -3.5)).rounded())
 ODOMETRY = Constraint(
@@ -80,19 +76,6 @@ CAMERA_PLACE = Place(
     frozen([[2.5, -1.25, 0.75], [3.0, 0.0, 1.5]], np.float32),
     frozen(np.arange(64).reshape(2, 32), np.uint8),
 )
-WORD_PLACE = WordPlace(
-    KeyscanId("alice", 12),
-    Channel.CAMERA,
-    "cnn-0.3+r12",
-    2,
-    12,
-    frozen([[2.5, -1.25, 0.75], [2.5, 1.25, 0.75], [3.0, 0.0, 1.5]], np.float32),
-    frozen([4095, 0, 2048], np.uint16),
-)
-_cells = np.zeros((256, 256), np.uint8)
-_cells[20:180, 30:200] = 1
-_cells[[20, 179], 30:200] = 2
-MAP_TILE = MapTile("alice", 0.05, -1, 2, frozen(_cells, np.uint8))
 TAG_SIGHTING = TagSighting(
     KeyscanId("alice", 12),
     Tag(TagFamily.APRILTAG_36H11, 586),
@@ -114,17 +97,13 @@ def packet(body: Body) -> Packet:
 EXAMPLES = {
     "hello": packet(HELLO),
     "floor_hello": packet(FLOOR_HELLO),
-    "words_hello": packet(WORDS_HELLO),
     "keyscan": packet(KEYSCAN),
-    "bare_keyscan": packet(BARE_KEYSCAN),
     "varied_keyscan": packet(VARIED_KEYSCAN),
     "swept_keyscan": packet(SWEPT_KEYSCAN),
     "odometry": packet(ODOMETRY),
     "closure": packet(CLOSURE),
     "lidar_place": packet(LIDAR_PLACE),
     "camera_place": packet(CAMERA_PLACE),
-    "word_place": packet(WORD_PLACE),
-    "map_tile": packet(MAP_TILE),
     "tag_sighting": packet(TAG_SIGHTING),
     "keyscan_fix": packet(KEYSCAN_FIX),
     "correction": packet(CORRECTION),

@@ -14,13 +14,11 @@ from fcslam.records import (
     KeyscanFix,
     KeyscanId,
     LaserModel,
-    MapTile,
     Place,
     Sweep,
     Tag,
     TagFamily,
     TagSighting,
-    WordPlace,
 )
 from fcslam.wire.limits import KEYPOINT_AXES
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
@@ -92,26 +90,6 @@ def places(draw, robot):
 
 
 @st.composite
-def word_places(draw, robot):
-    place = draw(places(robot))
-    count = len(place.keypoints)
-    most = draw(st.sampled_from([0, 1, 4095, 65535]))
-    words = draw(hnp.arrays(np.uint16, count, elements=st.integers(0, most)))
-    span = place.id, place.channel, place.detector_version, place.first, place.last
-    return WordPlace(*span, place.keypoints, words)
-
-
-@st.composite
-def map_tiles(draw, robot):
-    """Cells that are all equal, in blocks, or noise."""
-    block = draw(st.sampled_from([1, 16, 256]))
-    cells = np.random.default_rng(draw(st.integers(0, 9))).integers(0, 3, (256 // block, 256 // block), np.uint8)
-    number = st.integers(-(2**15), 2**15)
-    large = np.kron(cells, np.ones((block, block), np.uint8))
-    return MapTile(robot, draw(st.floats(0.001, 10.0)), draw(number), draw(number), large)
-
-
-@st.composite
 def constraints(draw, robot):
     j = draw(st.integers(1, 2**31 - 1))
     i = draw(st.integers(0, j - 1))
@@ -149,14 +127,12 @@ def sweeps():
 @st.composite
 def hellos(draw, robot, epoch):
     versions = draw(st.dictionaries(st.sampled_from(PLACE_CHANNELS), NAMES))
-    digests = st.binary(min_size=32, max_size=32)
     return Hello(
         robot,
         epoch,
         draw(st.lists(lasers(), min_size=1, max_size=8).map(tuple)),
         versions,
         draw(st.from_regex(r"([A-Za-z0-9._+-]{1,16})?", fullmatch=True)),
-        {channel: draw(digests) for channel in versions if draw(st.booleans())},
     )
 
 
@@ -176,8 +152,6 @@ def bodies(robot, epoch, time):
         keyscans(identity, stamps),
         constraints(robot),
         places(robot),
-        word_places(robot),
-        map_tiles(robot),
         st.builds(TagSighting, identity, tags(), poses(), informations()),
         keyscan_fixes(identity),
         st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses(), st.floats(0.0, 1.0, width=32)),

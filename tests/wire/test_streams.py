@@ -14,16 +14,12 @@ from fcslam.features.birdseye import describe
 from fcslam.wire.quantisation import quantise_keypoints
 from fcslam.wire.streams import (
     ascending,
-    pack_cells,
     pack_descriptors,
     pack_keypoints,
     pack_ranges,
-    pack_words,
-    unpack_cells,
     unpack_descriptors,
     unpack_keypoints,
     unpack_ranges,
-    unpack_words,
 )
 from tests.wire.strategies import codes
 
@@ -90,29 +86,12 @@ def test_descriptors_of_rooms_take_three_quarters():
     assert np.array_equal(unpack_descriptors(packed, len(expected)), expected)
 
 
-@given(hnp.arrays(np.uint16, st.integers(0, 100), elements=st.integers(0, 65535)))
-def test_words_come_back(expected):
-    packed = pack_words(expected)
-    assert len(packed) <= 2 * len(expected)
-    assert np.array_equal(unpack_words(packed, len(expected)), expected)
-
-
-@pytest.mark.parametrize("side", [1, 16, 256])
-def test_cells_come_back(side):
-    blocks = np.random.default_rng(0).integers(0, 3, (256 // side, 256 // side), np.uint8)
-    expected = np.kron(blocks, np.ones((side, side), np.uint8))
-    packed = pack_cells(expected)
-    assert len(packed) <= 256 * 256 // 4
-    assert np.array_equal(unpack_cells(packed), expected)
-
-
 UNPACK = {
     "ranges": lambda data, count: pack_ranges(unpack_ranges(data, count)),
     "keypoints": lambda data, count: pack_keypoints(unpack_keypoints(data, count, 3)),
     "descriptors": lambda data, count: pack_descriptors(unpack_descriptors(data, count)),
-    "words": lambda data, count: pack_words(unpack_words(data, count)),
 }
-PLAIN = {"ranges": 2, "keypoints": 6, "descriptors": 32, "words": 2}
+PLAIN = {"ranges": 2, "keypoints": 6, "descriptors": 32}
 
 
 @pytest.mark.parametrize("what", PLAIN)
@@ -131,7 +110,6 @@ def test_streams_that_end_early_or_go_on_are_refused(what):
         "ranges": pack_ranges(np.zeros(50, np.uint16)),
         "keypoints": pack_keypoints(np.zeros((50, 3), np.int16)),
         "descriptors": pack_descriptors(np.zeros((50, 32), np.uint8)),
-        "words": pack_words(np.zeros(50, np.uint16)),
     }[what]
     assert UNPACK[what](zeros, 50) == zeros
     for broken in (zeros + b"\x00", zeros + bytes(3), zeros[:-1], b"", UNPACK[what](b"", 0) + b"\x03\x00"):

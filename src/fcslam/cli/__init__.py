@@ -27,7 +27,6 @@ from fcslam.cli import (
     show,
     simulate,
     train,
-    vocabulary,
 )
 from fcslam.cli import changes as changed
 from fcslam.cli import localize as localization
@@ -97,7 +96,6 @@ COMMANDS: dict[str, tuple[str, Callable[..., None] | typer.Typer]] = {
     "tools train": (LEARNING, train.train),
     "tools federate": (LEARNING, federate.app),
     "tools extract": (LEARNING, extract.extract),
-    "tools vocabulary": (LEARNING, vocabulary.vocabulary),
 }
 """Group in the help, and function, of each command. A typer has commands and examples of its own."""
 EXAMPLES = """\
@@ -154,7 +152,6 @@ fcslam tools federate local robot1 robot2 robot3 --public photos -o fleet
 fcslam tools federate serve lab:8000 --insecure --public photos -o fleet
 fcslam tools federate join http://server.lab:8000 images --name robot1 -o home
 fcslam tools extract photos -o features --keypoints 1000
-fcslam tools vocabulary runs/building -o building.words
 """
 """Examples for the help of each command: the lines that begin with it."""
 

@@ -1,7 +1,6 @@
 """Limits of the data of a robot. No robot with a 2D LiDAR exceeds them, so no robot can exhaust or bend a mission."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +11,7 @@ from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import least_sigmas
 from fcslam.lidar.verification import CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
-from fcslam.records import Constraint, ConstraintKind, FloatArray, MapTile, Place, TagSighting, frozen
-from fcslam.wire.limits import TILE_CELLS
+from fcslam.records import Constraint, ConstraintKind, FloatArray, Place, TagSighting, frozen
 
 _ROUNDING = 1.01
 """Information is sent in single precision, and standard deviations are compared by its diagonal."""
@@ -25,8 +23,6 @@ WIDEST_SUBMAP_M = 100.0
 """Largest distance of a keyscan from the anchor of its submap, metres."""
 MOST_SUBMAP_KEYSCANS = 2000
 """Largest number of keyscans in a submap."""
-MOST_MAP_TILES = 1200
-"""Largest number of tiles, 256 by 256 cells each, of the box around a session's own map."""
 FARTHEST_TAG_M = 50.0
 """Largest distance at which a camera reads a tag, metres."""
 LEAST_SIGMA_M = 0.001
@@ -108,25 +104,6 @@ def check_distance(T_odom_base: FloatArray, robot: str, limits: ClaimLimits) -> 
         raise PacketError(
             f"{robot}: is {distance_m:.4g} m off its start, at most {limits.distance_m:g} m (fleet.claims)"
         )
-
-
-def check_tile(tile: MapTile, earlier: Mapping[tuple[int, int], MapTile], limits: ClaimLimits) -> None:
-    """Check the next tile of a robot's own map; ``earlier`` ones are by their column and row.
-
-    Raises:
-        PacketError: it was sent before, has another resolution, or there are too many, or it is too far away.
-    """
-    name = f"{tile.robot}: map tile ({tile.column}, {tile.row})"
-    if (tile.column, tile.row) in earlier:
-        raise PacketError(f"{name} was sent before")
-    if any(other.resolution_m != tile.resolution_m for other in earlier.values()):
-        raise PacketError(f"{name} has another resolution than those before")
-    columns, rows = np.ptp([(tile.column, tile.row), *earlier], axis=0) + 1
-    if columns * rows > MOST_MAP_TILES:
-        raise PacketError(f"{name} makes the map {columns} by {rows} tiles large, at most {MOST_MAP_TILES} tiles")
-    distance_m = math.hypot(tile.column, tile.row) * TILE_CELLS * tile.resolution_m
-    if not distance_m <= limits.distance_m:
-        raise PacketError(f"{name} is {distance_m:.4g} m off, at most {limits.distance_m:g} m (fleet.claims)")
 
 
 def check_sighting(sighting: TagSighting) -> None:

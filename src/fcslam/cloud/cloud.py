@@ -11,7 +11,7 @@ from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.errors import PacketError
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
-from fcslam.records import Place, WordPlace
+from fcslam.records import Place
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import decode, encode
 
@@ -80,7 +80,7 @@ class Cloud(FleetHost):
 
     def _replies(self, packet: Packet, session: str) -> list[Packet]:
         robot, epoch = packet.robot, packet.epoch
-        news = self._corrected(packet, session) if isinstance(packet.body, Place | WordPlace) else None
+        news = self._corrected(packet, session) if isinstance(packet.body, Place) else None
         known = -1 if news is None else news.correction.version - 1
         state = ReplyState({epoch: self.log.next_sequence(session)}, news)
         return replies(robot, state, known, {})

@@ -22,7 +22,6 @@ from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import in_session
 from fcslam.cloud.settings import FleetConfig, FusionStrategy
-from fcslam.cloud.shared_words import SharedWords
 from fcslam.cloud.stage_times import StageTimes
 from fcslam.cloud.tags import SeenTags
 from fcslam.errors import PacketError
@@ -40,10 +39,8 @@ from fcslam.records import (
     KeyscanFix,
     KeyscanId,
     ManualClosure,
-    MapTile,
     Place,
     TagSighting,
-    WordPlace,
     frozen,
 )
 from fcslam.storage.state_file import State
@@ -74,14 +71,10 @@ class Fleet:
             seed: of the random generator.
             verify_pairs: verifies pairs of submaps, here or on a pool; the result is the same.
             read: gives stored packets by their numbers, for ``restored``.
-
-        Raises:
-            InputError: a vocabulary of the settings cannot be read.
         """
         self._config = config
         self._verify_pairs = verify_pairs
         self._seed = seed
-        self._words = SharedWords(config)
         self._sessions = SessionStore(config.claims, read)
         self.stages = StageTimes()
         """Times of verification and of solves, since this fleet was made."""
@@ -111,7 +104,6 @@ class Fleet:
             return
         match packet.body:
             case Hello() as hello:
-                self._words.check_hello(hello)
                 self._sessions.add_hello(hello, packet.sequence)
             case Keyscan() as keyscan:
                 self._add_keyscan(keyscan, packet.sequence)
@@ -123,15 +115,13 @@ class Fleet:
                 check_constraint(closure, LONGEST_CLOSURE_M)
                 self._decisions.add_local(with_least_noise(closure))
             case Place() as place:
-                self._place(place)
-            case WordPlace() as place:
-                self._place(self._words.place(place, self._sessions.vocabularies(place.id.robot)))
+                self._check_submap(place)
+                self._sessions.add_place(place)
+                self._add_place(place)  # place recognition and map fusion
             case TagSighting() as sighting:
                 self._add_sighting(sighting)
             case KeyscanFix() as fix:
                 self._sessions.add_fix(fix)
-            case MapTile() as tile:
-                self._sessions.add_tile(tile, packet.sequence)
             case Correction() | Acknowledgement() | DetectorUpdate():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
 
@@ -312,16 +302,10 @@ class Fleet:
         return Correction(session, self._decisions.version, indices[session], T_map_odom, quality)
 
     def _add_keyscan(self, keyscan: Keyscan, sequence: int) -> None:
-        self._words.check_keyscan(keyscan)
         self._sessions.add_keyscan(keyscan, sequence)
         if keyscan.id.number == 0:
             self._graph.start(keyscan.id.robot)
             self._decisions.start_map(keyscan.id.robot)
-
-    def _place(self, place: Place) -> None:
-        self._check_submap(place)
-        self._sessions.add_place(place)
-        self._add_place(place)  # place recognition and map fusion
 
     def _add_sighting(self, sighting: TagSighting) -> None:
         """Match a sighting with those of the same tag, decide about the closures, join maps, optimize."""

@@ -15,7 +15,7 @@ from fcslam.geometry import se2
 from fcslam.graph.evidence import ClusterEvidence
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.maps.fusion import fuse, laid_together
+from fcslam.maps.fusion import fuse
 from fcslam.maps.occupancy_map import OccupancyMap, map_stem, map_yaml, pgm_bytes, server_files
 from fcslam.maps.run_pictures import picture, quality_files
 from fcslam.processes import trim_memory
@@ -135,9 +135,7 @@ def _link_metrics(link: str, traffic: Mapping[str, Traffic], tracks: Mapping[str
 
 def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig) -> LocalMap:
     """The robot's own map, made without other robots."""
-    fused = robot.own_map or fuse(
-        robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.lasers}, grid
-    )
+    fused = fuse(robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.lasers}, grid)
     name = f"{robot.robot}.pgm"
     return LocalMap(
         robot.robot,
@@ -217,9 +215,7 @@ def fuse_members(members: Sequence[MappedRobot], grid: OccupancyConfig) -> Occup
     keyscans = [keyscan for robot in members for keyscan in robot.keyscans]
     poses: FloatArray = np.concatenate([robot.T_map_base[robot.numbers()] for robot in members])
     senders = {robot.robot: robot_of(robot.robot) for robot in members}
-    fused = fuse(keyscans, poses, {robot.robot: robot.lasers for robot in members}, grid, senders)
-    own = [(robot.own_map, robot.T_map_local) for robot in members if robot.own_map is not None]
-    return laid_together([(fused, np.zeros(3)), *own], grid.maximum_cells) if own else fused
+    return fuse(keyscans, poses, {robot.robot: robot.lasers for robot in members}, grid, senders)
 
 
 def _counts(result: FleetResult) -> list[Metric]:

@@ -14,7 +14,6 @@ from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
 from fcslam.graph.evidence import ClusterEvidence
 from fcslam.graph.pose_graph import PoseGraph
-from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import (
     Change,
     ClosureStatus,
@@ -52,15 +51,8 @@ class MappedRobot:
     """As the robot announced them."""
     floor: str = ""
     """Floor that the session named; empty: none."""
-    own_map: OccupancyMap | None = None
-    """The map that it sent, in its own frame, if its ranges stay on the robot."""
     fixes: tuple[KeyscanFix, ...] = ()
     """Fixes of satellite navigation at its keyscans."""
-
-    @property
-    def T_map_local(self) -> FloatArray:
-        """Pose of its own map in its map, shape (3,), metres and radians."""
-        return se2.compose(self.T_map_base[0], se2.inverse(self.T_local_base[0]))
 
     def numbers(self) -> NDArray[np.int64]:
         """Rows of ``keyscans`` in stamps and poses, ascending."""
@@ -139,7 +131,6 @@ def conclude(
             frozen(variables[robot], np.int64),
             sessions.lasers(robot),
             sessions.floor(robot),
-            sessions.own_map(robot),
             tuple(fix for fix in sessions.fixes(robot) if not is_cut(robot, sessions.stamp(fix.id), changes)),
         )
         for robot in names

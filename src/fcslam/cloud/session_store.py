@@ -6,14 +6,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from fcslam.cloud.claims import LONGEST_MOTION_M, ClaimLimits, check_constraint, check_distance, check_tile
+from fcslam.cloud.claims import LONGEST_MOTION_M, ClaimLimits, check_constraint, check_distance
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.sessions import in_session
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.geometry.beams import misfit
-from fcslam.maps.fusion import joined_tiles
-from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import (
     Channel,
     Constraint,
@@ -22,14 +20,13 @@ from fcslam.records import (
     KeyscanFix,
     KeyscanId,
     LaserModel,
-    MapTile,
     Place,
 )
 from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Hello, Packet
 
-_Body = TypeVar("_Body", Hello, Keyscan, MapTile)
+_Body = TypeVar("_Body", Hello, Keyscan)
 
 
 @dataclass(slots=True)
@@ -64,9 +61,6 @@ class _Session:
     """Keyscan, channel and detector version of every place."""
     spans: dict[tuple[int, Channel], tuple[int, int]] = field(default_factory=dict)
     """First and last keyscan behind the places at a keyscan, whichever detector described them."""
-    tiles: dict[tuple[int, int], MapTile] = field(default_factory=dict)
-    """Tiles of its own map, by column and row."""
-    tile_sequences: list[int] = field(default_factory=list)
     fixes: dict[int, KeyscanFix] = field(default_factory=dict)
     """Of satellite navigation, by keyscan."""
 
@@ -169,18 +163,6 @@ class SessionStore:
         first, last = self.span(place.id, place.channel)
         session.spans[number, place.channel] = min(first, place.first), max(last, place.last)
 
-    def add_tile(self, tile: MapTile, sequence: int) -> None:
-        """A tile of the session's own map; ``sequence`` is the number of its packet.
-
-        Raises:
-            PacketError: the session has no keyscan, or no robot has such a map.
-        """
-        self.require(KeyscanId(tile.robot, 0))
-        session = self._sessions[tile.robot]
-        check_tile(tile, session.tiles, self._limits)
-        session.tiles[tile.column, tile.row] = tile
-        session.tile_sequences.append(sequence)
-
     def add_fix(self, fix: KeyscanFix) -> None:
         """A fix of satellite navigation.
 
@@ -197,11 +179,6 @@ class SessionStore:
     def fixes(self, robot: str) -> tuple[KeyscanFix, ...]:
         """The fixes of satellite navigation of the robot."""
         return tuple(self._sessions[robot].fixes.values())
-
-    def own_map(self, robot: str) -> OccupancyMap | None:
-        """The map that the session sent, in its own frame; None if it sent none."""
-        tiles = self._sessions[robot].tiles
-        return joined_tiles(tiles.values()) if tiles else None
 
     def require(self, *ids: KeyscanId) -> None:
         """Check that the keyscans are there.
@@ -230,12 +207,11 @@ class SessionStore:
                 kept.keyscan, kept.is_released = None, True
 
     def keyscans(self, robot: str, first: int = 0, last: int | None = None) -> tuple[Keyscan, ...]:
-        """Connected keyscans first to last (inclusive) of a robot, without released ones and those
-        whose ranges stay on the robot."""
+        """Connected keyscans first to last (inclusive) of a robot, without released ones."""
         session = self._sessions[robot]
         end = session.connected if last is None else last + 1
         kept = (self._keyscan(robot, number) for number in range(first, end))
-        return tuple(keyscan for keyscan in kept if keyscan is not None and len(keyscan.ranges_m))
+        return tuple(keyscan for keyscan in kept if keyscan is not None)
 
     def read_ahead(self, most: int) -> bool:
         """Read up to ``most`` of the keyscans that ``restore`` named; False: all are read."""
@@ -269,10 +245,6 @@ class SessionStore:
         """Take over the floors that users gave, by session."""
         self._floors = dict(floors)
 
-    def vocabularies(self, robot: str) -> Mapping[Channel, bytes]:
-        """Digests of the vocabularies of the words that the robot sends now; nothing before its hello."""
-        return self._sessions[robot].hello.vocabularies if robot in self._sessions else {}
-
     def floor(self, robot: str) -> str:
         """Floor that a user gave to the session, or else the one that it named; empty if neither is known."""
         return self._floors.get(robot, self._sessions[robot].hello.floor)
@@ -294,7 +266,6 @@ class SessionStore:
             ]
 
     def _restored(self, name: str, state: State) -> _Session:
-        tiles = [self._stored(PacketNumber(name, sequence), MapTile) for sequence in state["tiles"]]
         columns = (state["keyscans"][key].tolist() for key in ("stamps", "sequences", "released", "holders"))
         return _Session(
             hello=self._stored(PacketNumber(name, state["hello"]), Hello),
@@ -308,8 +279,6 @@ class SessionStore:
             T_odom_base=from_state(FloatArray | None, state["T_odom_base"]),
             places=from_state(set[tuple[int, Channel, str]], state["places"]),
             spans=from_state(dict[tuple[int, Channel], tuple[int, int]], state["spans"]),
-            tiles={(tile.column, tile.row): tile for tile in tiles},
-            tile_sequences=state["tiles"],
             fixes=from_state(dict[int, KeyscanFix], state["fixes"]),
         )
 
@@ -331,8 +300,6 @@ class SessionStore:
         robot, lasers = keyscan.id.robot, self.lasers(keyscan.id.robot)
         if keyscan.laser >= len(lasers):
             raise PacketError(f"{robot}: a keyscan of laser {keyscan.laser}, {len(lasers)} announced")
-        if not len(keyscan.ranges_m):
-            return
         announced = lasers[keyscan.laser]
         reason = None if keyscan.beams is None else misfit(keyscan.beams, announced.beams)
         if reason is not None:
@@ -354,7 +321,6 @@ def _session_state(session: _Session) -> State:
         "connected": session.connected,
         "places": to_state(session.places),
         "spans": to_state(session.spans),
-        "tiles": session.tile_sequences.copy(),
         "fixes": to_state(session.fixes),
         "T_odom_base": to_state(session.T_odom_base),
     }

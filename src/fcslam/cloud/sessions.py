@@ -14,10 +14,8 @@ from fcslam.records import (
     Keyscan,
     KeyscanFix,
     KeyscanId,
-    MapTile,
     Place,
     TagSighting,
-    WordPlace,
 )
 from fcslam.wire.checks import check_name
 from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
@@ -68,7 +66,7 @@ def in_session(packet: Packet) -> Packet:
 
 def _renamed(body: Body, session: str) -> Body:
     match body:
-        case Keyscan() | Place() | WordPlace() | TagSighting() | KeyscanFix():
+        case Keyscan() | Place() | TagSighting() | KeyscanFix():
             return replace(body, id=KeyscanId(session, body.id.number))
-        case Hello() | Constraint() | MapTile() | Correction() | Acknowledgement() | DetectorUpdate():
+        case Hello() | Constraint() | Correction() | Acknowledgement() | DetectorUpdate():
             return replace(body, robot=session)

@@ -1,7 +1,6 @@
 """The settings of the cloud; a mission stores them, so that its result can be computed again from its packets."""
 
 from enum import StrEnum
-from pathlib import Path
 from typing import Self
 
 from pydantic import Field, PositiveFloat, model_validator
@@ -52,11 +51,6 @@ class FleetConfig(Settings):
     )
     claims: ClaimLimits = Field(default=ClaimLimits(), description="bounds on what a robot may claim")
     matcher: MatcherConfig = Field(default=MatcherConfig(), description="place recognition")
-    vocabularies: tuple[Path, ...] = Field(
-        default=(),
-        description="vocabulary files, as `fcslam tools vocabulary` writes them, whose words robots may send; other "
-        "words are refused",
-    )
     consistency: ConsistencySettings = Field(
         default=ConsistencySettings(), description="pairwise consistency of closures, and the rule for joining maps"
     )

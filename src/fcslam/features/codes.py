@@ -73,17 +73,6 @@ def mutual_matches(a: Codes, b: Codes, max_distance: int = CODE_BITS) -> Matches
     return Matches(*_mutual_matches(code_words(a), code_words(b), max_distance))
 
 
-def nearest_codes(a: Codes, b: Codes) -> NDArray[np.int64]:
-    """Index of the nearest code of ``b`` (M, 32), M > 0, to every code of ``a`` (N, 32), shape (N,); of equal ones the
-    first.
-    """
-    if len(b) > _MOST_CODES:
-        raise ValueError(f"at most {_MOST_CODES} codes a set, not {len(b)}")
-    row_keys, _ = _nearest_keys(code_words(a), code_words(b))
-    nearest: NDArray[np.int64] = (row_keys & np.uint32(_MOST_CODES - 1)).astype(np.int64)
-    return nearest
-
-
 @njit(allocates=False)
 def hamming(a: CodeWords, b: CodeWords) -> Any:
     """Hamming distance between two codes, shape (4,) each, in bits; for use in compiled code."""

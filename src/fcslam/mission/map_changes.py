@@ -140,10 +140,10 @@ def _seen(run: Run, mission: SavedMission, map_index: int, name: str) -> _Seen:
                 continue
             if isinstance(packet.body, Hello):
                 lasers[packet.robot] = packet.body.lasers
-            elif isinstance(packet.body, Keyscan) and len(packet.body.ranges_m) and is_mapped(packet.body):
+            elif isinstance(packet.body, Keyscan) and is_mapped(packet.body):
                 keyscans.append(packet.body)
     if not keyscans:
-        raise SourceError(f"{name}: no robot of map {map_index} sent ranges (robot.sends: words); nothing to compare")
+        raise SourceError(f"{name}: the mission has no keyscan of map {map_index}; nothing to compare")
     stamps = {name: np.argsort(robot.stamps, kind="stable") for name, robot in members.items()}
     for keyscan in keyscans:
         robot, order = members[keyscan.id.robot], stamps[keyscan.id.robot]

@@ -9,9 +9,8 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Self
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from fcslam.anchoring.anchors import Anchored, Anchors, anchored
 from fcslam.cloud.cloud import Cloud
@@ -28,11 +27,9 @@ from fcslam.mission.driving import Drive, Leg, continued, one_by_one
 from fcslam.mission.floors import on_floors
 from fcslam.mission.mission_file import EMPTY, SavedMission, as_stored, mission_bytes
 from fcslam.mission.mission_store import StoredPacket
-from fcslam.places.matcher import MatchDecision
 from fcslam.processes import trim_memory
 from fcslam.records import Edit, Placement, Veto
 from fcslam.robot.frontend import RobotConfig
-from fcslam.robot.words import Sends
 from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
@@ -53,15 +50,6 @@ class MissionConfig(Settings):
     robot: RobotConfig = Field(default=RobotConfig(), description="settings of the robots")
     fleet: FleetConfig = Field(default=FleetConfig(), description="settings of the cloud")
     map: OccupancyConfig = Field(default=OccupancyConfig(), description="the occupancy grid")
-
-    @model_validator(mode="after")
-    def _words_do_not_show_geometry(self) -> Self:
-        if self.robot.sends is Sends.WORDS and self.fleet.matcher.decision is not MatchDecision.SIMILARITY:
-            raise ValueError(
-                "robot.sends words leaves no ranges to verify places with; set fleet.matcher.decision to similarity "
-                "and fleet.fusion to two_point, or give --config paper"
-            )
-        return self
 
     @property
     def cloud(self) -> CloudConfig:

@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, Field
 
+from fcslam.config import Settings
 from fcslam.errors import FeatureError
 from fcslam.features.birdseye import DETECTOR_VERSION
 from fcslam.geometry import se2
@@ -36,7 +37,6 @@ from fcslam.robot.keyframe_folder import KeyframeFolder
 from fcslam.robot.own_places import OwnPlaces
 from fcslam.robot.tag_detection import TagDetector, TagsConfig
 from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
-from fcslam.robot.words import SendingConfig, Sends, WordSender, without_ranges
 from fcslam.wire.messages import Body, Hello
 
 
@@ -46,7 +46,7 @@ def _of_places(channel: Channel) -> Channel:
     return channel
 
 
-class SessionConfig(SendingConfig):
+class SessionConfig(Settings):
     """Settings of everything that turns sensor records into packets."""
 
     lidar: LidarConfig = Field(default=LidarConfig(), description="LiDAR SLAM of one robot")
@@ -112,7 +112,7 @@ class RobotBackend:
     """Handles the inputs of one robot, session after session. The epoch is the number of the session, from 0."""
 
     def __init__(self, robot: str, config: SessionConfig, keyframes: Path | None = None) -> None:
-        """Load the detector of camera images and, if the robot sends words, their vocabulary.
+        """Load the detector of camera images.
 
         Args:
             robot: its name.
@@ -121,8 +121,7 @@ class RobotBackend:
 
         Raises:
             InputError: the folder cannot be written.
-            FeatureError: the detector is a network whose weights cannot be used, or there are no words for it.
-            InputError: the file of the vocabulary cannot be read.
+            FeatureError: the detector is a network whose weights cannot be used.
         """
         self._robot = robot
         self._config = config
@@ -130,10 +129,7 @@ class RobotBackend:
         self._view_extractor = ViewExtractor(config.views, self._folder)
         self._unplaced = self._placed = 0
         """Keyframes since their poses were written last, and all until then."""
-        self._words = WordSender(config.words) if config.sends is Sends.WORDS else None
         self._session = _Session(robot, 0, self._view_extractor, config)
-        if self._words is not None:
-            self._words.check(self._session.detector_versions)
 
     @property
     def keyframes(self) -> tuple[KeyframeImage, ...]:
@@ -144,16 +140,9 @@ class RobotBackend:
         """Handle the next input; returns what the robot sends because of it.
 
         Raises:
-            FeatureError: the file of a new detector is not the announced one or cannot be used. Or it describes a
-                channel that this robot does not use, or has no words for. Nothing has changed then.
+            FeatureError: the file of a new detector is not the announced one or cannot be used, or it describes a
+                channel that this robot does not use. Nothing has changed then.
         """
-        bodies = self._process(input)
-        if self._words is None:
-            return bodies
-        sent = self._words.convert(bodies)
-        return [*sent, *self._words.end_session()] if isinstance(input, SessionEnd) else sent
-
-    def _process(self, input: BackendInput) -> list[Body]:
         match input:
             case NewKeyscan():
                 return self._session.add(input)
@@ -194,8 +183,6 @@ class RobotBackend:
             raise FeatureError(
                 f"{file.version}: describes {file.channel} places; this robot does not use detectors of that channel"
             )
-        if self._words is not None:
-            self._words.check({file.channel: file.version})
         if file.version != self._view_extractor.detector_version:
             self._view_extractor.set_detector(file, path)
 
@@ -322,8 +309,7 @@ class _Session:
         return Hello(self._robot, self.epoch, self._lasers, self.detector_versions)
 
 
-def essential(input: NewKeyscan, sends: Sends = Sends.DESCRIPTORS) -> list[Body]:
+def essential(input: NewKeyscan) -> list[Body]:
     """Records that the pose graph needs in any case: the keyscan and its odometry."""
     keyscan, odometry = input.keyscan.record, input.keyscan.odometry
-    record = without_ranges(keyscan) if sends is Sends.WORDS else keyscan
-    return [record] if odometry is None else [record, odometry]
+    return [keyscan] if odometry is None else [keyscan, odometry]

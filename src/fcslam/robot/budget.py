@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 from dataclasses import replace
 
-from fcslam.records import CODE_BYTES, Place, WordPlace
-from fcslam.wire.limits import BYTES_PER_AXIS, BYTES_PER_WORD, KEYPOINT_AXES
+from fcslam.records import CODE_BYTES, Place
+from fcslam.wire.limits import BYTES_PER_AXIS, KEYPOINT_AXES
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 
@@ -37,7 +37,7 @@ class Budget:
             if self._began is None:
                 self._began = packet.time
             place = packet.body
-            chosen = self._thinned(packet, place) if isinstance(place, Place | WordPlace) else packet
+            chosen = self._thinned(packet, place) if isinstance(place, Place) else packet
             if chosen is None:
                 self.left_out += 1
                 continue
@@ -45,20 +45,14 @@ class Budget:
             kept.append(chosen)
         return kept
 
-    def _thinned(self, packet: Packet, place: Place | WordPlace) -> Packet | None:
+    def _thinned(self, packet: Packet, place: Place) -> Packet | None:
         seconds = packet.time - (packet.time if self._began is None else self._began)
         room = self._bytes_per_s * (seconds + BURST_S) - self._spent - ENVELOPE_BYTES
-        described = CODE_BYTES if isinstance(place, Place) else BYTES_PER_WORD
-        fitting = room / (described + BYTES_PER_AXIS * KEYPOINT_AXES[place.channel])
+        fitting = room / (CODE_BYTES + BYTES_PER_AXIS * KEYPOINT_AXES[place.channel])
         if fitting >= len(place.keypoints):
             return packet
         if fitting < FEWEST_DESCRIPTORS:
             return None
         count = int(fitting)
-        keypoints = place.keypoints[:count]
-        few: Place | WordPlace
-        if isinstance(place, Place):
-            few = replace(place, keypoints=keypoints, descriptors=place.descriptors[:count])
-        else:
-            few = replace(place, keypoints=keypoints, words=place.words[:count])
+        few = replace(place, keypoints=place.keypoints[:count], descriptors=place.descriptors[:count])
         return replace(packet, body=few)

@@ -81,9 +81,7 @@ class RobotFrontend:
         self.odometry = WheelOdometry()
         self._motion: Motion = self.odometry
         """Of the sessions from the next one on."""
-        self.packets = PacketQueue(
-            robot, InlineBackend(RobotBackend(robot, config)) if backend is None else backend, config.sends
-        )
+        self.packets = PacketQueue(robot, backend or InlineBackend(RobotBackend(robot, config)))
         self.newest: NewestScan | None = None
         """The newest scan; None before the first."""
         self._config, self._mark = config, mark

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fcslam.errors import InputError, PacketError, StoreError
-from fcslam.records import Channel, DetectorFile, Place, WordPlace
+from fcslam.records import Channel, DetectorFile, Place
 from fcslam.storage.database import Database
 from fcslam.wire.batches import LENGTH
 from fcslam.wire.limits import MAXIMUM_EPOCH
@@ -175,7 +175,7 @@ class Outbox:
                 if self._is_known(connection, epoch, packet.sequence, digest):
                     continue
                 crowded = self.waiting.bytes >= PLACES_SHARE * self._limit_bytes
-                if crowded and isinstance(packet.body, Place | WordPlace):
+                if crowded and isinstance(packet.body, Place):
                     _insert(connection, epoch, packet.sequence, digest, None, None)
                     dropped += 1
                     continue

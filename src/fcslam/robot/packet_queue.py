@@ -8,7 +8,6 @@ from fcslam.errors import FeatureError
 from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd, essential
 from fcslam.robot.backend_runner import BackendRunner
 from fcslam.robot.track import ScanTrack
-from fcslam.robot.words import Sends
 from fcslam.wire.messages import Body, Hello, Packet
 
 
@@ -27,10 +26,10 @@ class _Waiting:
 class PacketQueue:
     """Gives inputs to the back end and numbers the packets; each session numbers its own from 0."""
 
-    def __init__(self, robot: str, backend: BackendRunner, sends: Sends) -> None:
+    def __init__(self, robot: str, backend: BackendRunner) -> None:
         self.failure: str | None = None
         """Why the back end ended early; from then on the robot sends neither closures nor places. None if it works."""
-        self._robot, self._backend, self._sends = robot, backend, sends
+        self._robot, self._backend = robot, backend
         self._waiting: deque[_Waiting] = deque()
         self._time = float("-inf")
         self._sequence = 0
@@ -94,4 +93,4 @@ class PacketQueue:
         lasers, last = done.input.lasers, self._hello
         is_known = last is not None and last.lasers == lasers
         hello = Hello(self._robot, done.epoch, lasers, {}) if last is None else replace(last, lasers=lasers)
-        return [*([] if is_known else [hello]), *essential(done.input, self._sends)]
+        return [*([] if is_known else [hello]), *essential(done.input)]

@@ -12,7 +12,7 @@ from fcslam.cloud.replies import ReplyState, replies
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
 from fcslam.errors import FcslamError, PacketError
 from fcslam.mission.mission_store import MissionStore, StoredPacket
-from fcslam.records import Channel, DetectorFile, Place, WordPlace
+from fcslam.records import Channel, DetectorFile, Place
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS
 from fcslam.wire.messages import UPLINK, PacketKind
@@ -281,5 +281,5 @@ def _read(robot: str, data: bytes) -> StoredPacket:
         raise PacketError(f"a packet of robot {packet.robot}, sent by {robot}")
     if kind not in UPLINK:
         raise PacketError(f"{robot}: a {kind} goes to a robot, not to the cloud")
-    channel = packet.body.channel if isinstance(packet.body, Place | WordPlace) else None
+    channel = packet.body.channel if isinstance(packet.body, Place) else None
     return StoredPacket(robot, packet.epoch, packet.sequence, packet.time, PacketKind(kind), channel, data)

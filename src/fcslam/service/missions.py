@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import IO
 
-from fcslam.cloud.settings import CloudConfig, FleetConfig
-from fcslam.cloud.shared_words import SharedWords
+from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import InputError, StoreError
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Change, Edit, Undo
@@ -99,16 +98,6 @@ class OpenMission:
 def existing_result(folder: MissionFolder, name: str) -> Path | None:
     """The run folder of a requested result, if it is there."""
     return folder.run(name).resolve() if folder.run(name).is_dir() else None
-
-
-def check_words(name: str, settings: FleetConfig) -> None:
-    """Check that the vocabularies of a mission's settings can be read; without them, every worker would end at its
-    start.
-    """
-    try:
-        SharedWords(settings)
-    except InputError as error:
-        raise InputError(f"mission '{name}': {error}") from error
 
 
 def _check_file(folder: MissionFolder) -> None:
@@ -213,7 +202,6 @@ class Missions:
         store = MissionStore(folder.store)
         try:
             settings = store.configure(self._config).fleet
-            check_words(name, settings)
             intake = Intake(store, self._clock, self._wall_clock, self.detectors.announced, settings.claims)
         except BaseException:
             store.close()

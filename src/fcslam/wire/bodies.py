@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from google.protobuf.message import Message
-from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
 from fcslam.records import (
@@ -21,13 +20,11 @@ from fcslam.records import (
     KeyscanFix,
     KeyscanId,
     LaserModel,
-    MapTile,
     Place,
     Sweep,
     Tag,
     TagFamily,
     TagSighting,
-    WordPlace,
     frozen,
 )
 from fcslam.wire import fcslam_pb2 as pb
@@ -42,18 +39,13 @@ from fcslam.wire.quantisation import (
     unpack_information,
 )
 from fcslam.wire.streams import (
-    KeypointCodes,
     ascending,
-    pack_cells,
     pack_descriptors,
     pack_keypoints,
     pack_ranges,
-    pack_words,
-    unpack_cells,
     unpack_descriptors,
     unpack_keypoints,
     unpack_ranges,
-    unpack_words,
 )
 
 _CHANNELS = {Channel.LIDAR: pb.CHANNEL_LIDAR, Channel.CAMERA: pb.CHANNEL_CAMERA}
@@ -69,11 +61,7 @@ def _write_hello(hello: Hello) -> pb.Hello:
     return pb.Hello(
         lasers=map(_write_laser, hello.lasers),
         detectors=[
-            pb.Detector(
-                channel=code,
-                version=hello.detector_versions[channel],
-                vocabulary=hello.vocabularies.get(channel, b""),
-            )
+            pb.Detector(channel=code, version=hello.detector_versions[channel])
             for channel, code in _CHANNELS.items()
             if channel in hello.detector_versions
         ],
@@ -89,9 +77,7 @@ def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
         raise PacketError("hello: detectors are not in ascending order of their channels")
     channels = [read_channel(code) for code in codes]
     versions = {channel: each.version for channel, each in zip(channels, message.detectors, strict=True)}
-    words = {channel: each.vocabulary for channel, each in zip(channels, message.detectors, strict=True)}
-    vocabularies = {channel: digest for channel, digest in words.items() if digest}
-    return Hello(envelope.robot, envelope.epoch, lasers, versions, message.floor, vocabularies)
+    return Hello(envelope.robot, envelope.epoch, lasers, versions, message.floor)
 
 
 def _write_laser(laser: LaserModel) -> pb.Laser:
@@ -161,63 +147,34 @@ def _read_information(numbers: Sequence[float], what: str) -> FloatArray:
 
 
 def _write_place(place: Place) -> pb.Place:
-    codes, order = _in_order(place)
-    return pb.Place(**_described(place, codes), descriptors=pack_descriptors(place.descriptors[order]))
-
-
-def _write_word_place(place: WordPlace) -> pb.WordPlace:
-    codes, order = _in_order(place)
-    return pb.WordPlace(**_described(place, codes), words=pack_words(place.words[order]))
-
-
-def _in_order(place: Place | WordPlace) -> tuple[KeypointCodes, NDArray[np.intp]]:
-    """Keypoints in ascending order, as they are sent, and the order."""
+    """The keypoints in ascending order, with their descriptors."""
     codes = quantise_keypoints(place.keypoints)
     order = ascending(codes)
-    return codes[order], order
-
-
-def _described(place: Place | WordPlace, codes: KeypointCodes) -> dict[str, Any]:
-    """The fields that both kinds of places have."""
-    return {
-        "number": place.id.number,
-        "channel": _CHANNELS[place.channel],
-        "detector_version": place.detector_version,
-        "first": place.first,
-        "last": place.last,
-        "count": len(codes),
-        "keypoints": pack_keypoints(codes),
-    }
+    return pb.Place(
+        number=place.id.number,
+        channel=_CHANNELS[place.channel],
+        detector_version=place.detector_version,
+        first=place.first,
+        last=place.last,
+        count=len(codes),
+        keypoints=pack_keypoints(codes[order]),
+        descriptors=pack_descriptors(place.descriptors[order]),
+    )
 
 
 def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
-    described = _read_described(message, envelope, "place")
-    return Place(*described, frozen(unpack_descriptors(message.descriptors, message.count), np.uint8))
-
-
-def _read_word_place(message: pb.WordPlace, envelope: pb.Packet) -> WordPlace:
-    described = _read_described(message, envelope, "word place")
-    return WordPlace(*described, frozen(unpack_words(message.words, message.count), np.uint16))
-
-
-def _read_described(
-    message: pb.Place | pb.WordPlace, envelope: pb.Packet, what: str
-) -> tuple[KeyscanId, Channel, str, int, int, NDArray[np.float32]]:
-    """The fields that both kinds of places have."""
-    _check_at_most(message.count, limits.MAXIMUM_KEYPOINTS, f"{what}: keypoints")
+    _check_at_most(message.count, limits.MAXIMUM_KEYPOINTS, "place: keypoints")
     channel = read_channel(message.channel)
     codes = unpack_keypoints(message.keypoints, message.count, limits.KEYPOINT_AXES[channel])
-    number, keypoints = KeyscanId(envelope.robot, message.number), dequantise_keypoints(codes)
-    return number, channel, message.detector_version, message.first, message.last, keypoints
-
-
-def _write_map_tile(tile: MapTile) -> pb.MapTile:
-    return pb.MapTile(resolution_m=tile.resolution_m, column=tile.column, row=tile.row, cells=pack_cells(tile.cells))
-
-
-def _read_map_tile(message: pb.MapTile, envelope: pb.Packet) -> MapTile:
-    cells = frozen(unpack_cells(message.cells), np.uint8)
-    return MapTile(envelope.robot, message.resolution_m, message.column, message.row, cells)
+    return Place(
+        KeyscanId(envelope.robot, message.number),
+        channel,
+        message.detector_version,
+        message.first,
+        message.last,
+        dequantise_keypoints(codes),
+        frozen(unpack_descriptors(message.descriptors, message.count), np.uint8),
+    )
 
 
 def _write_tag_sighting(sighting: TagSighting) -> pb.TagSighting:
@@ -339,7 +296,6 @@ def _for_each(size: int, most: int) -> Callable[[Any], int]:
 _KEYPOINT_BYTES = limits.BYTES_PER_AXIS * max(limits.KEYPOINT_AXES.values())
 _RANGES = _for_each(limits.BYTES_PER_RANGE, limits.MAXIMUM_BEAMS)
 _DESCRIBED = _for_each(_KEYPOINT_BYTES + CODE_BYTES, limits.MAXIMUM_KEYPOINTS)
-_IN_WORDS = _for_each(_KEYPOINT_BYTES + limits.BYTES_PER_WORD, limits.MAXIMUM_KEYPOINTS)
 
 
 class Codec(NamedTuple):
@@ -357,8 +313,6 @@ CODECS = {
     PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, _RANGES),
     PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint),
     PacketKind.PLACE: Codec(Place, _write_place, _read_place, _DESCRIBED),
-    PacketKind.WORD_PLACE: Codec(WordPlace, _write_word_place, _read_word_place, _IN_WORDS),
-    PacketKind.MAP_TILE: Codec(MapTile, _write_map_tile, _read_map_tile, _always(limits.BYTES_PER_TILE)),
     PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting),
     PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix),
     PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),

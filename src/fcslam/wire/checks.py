@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
 from fcslam.geometry.beams import FULL_TURN_RAD, LARGEST_SPAN_RAD
-from fcslam.maps.occupancy_map import Occupancy
 from fcslam.records import (
     CODE_BYTES,
     FLOOR,
@@ -21,17 +20,15 @@ from fcslam.records import (
     Keyscan,
     KeyscanFix,
     LaserModel,
-    MapTile,
     Place,
     Sweep,
     TagSighting,
-    WordPlace,
 )
 from fcslam.wire import limits
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise
 
-_OF_KEYSCANS = Keyscan | Place | WordPlace | TagSighting | KeyscanFix
+_OF_KEYSCANS = Keyscan | Place | TagSighting | KeyscanFix
 
 
 def check(packet: Packet) -> None:
@@ -62,9 +59,6 @@ def _check_hello(hello: Hello, packet: Packet) -> None:
         check_name(version, f"hello: detector version of {channel}")
     if hello.floor:
         check_floor(hello.floor)
-    for channel, digest in hello.vocabularies.items():
-        _require(channel in hello.detector_versions, f"hello: a vocabulary of {channel}, which has no detector")
-        _check_digest(digest, f"hello: vocabulary of {channel}")
 
 
 def check_floor(floor: str) -> None:
@@ -151,26 +145,20 @@ def _exceeds(limit: float, xy: float, xt: float, yt: float) -> bool:
 
 
 def _check_place(place: Place, _: Packet) -> None:
-    _check_described(place)
-    _check_shape(place.descriptors, (len(place.keypoints), CODE_BYTES), "place: descriptors")
+    _check_count(place.id.number, "place: number")
+    _check_count(place.first, "place: first")
+    _check_count(place.last, "place: last")
+    _require(place.first <= place.last, f"place: first = {place.first} is after last = {place.last}")
+    within = place.first <= place.id.number <= place.last
+    _require(within, f"place: number = {place.id.number} is not in {place.first}..{place.last}")
+    check_name(place.detector_version, "place: detector version")
+    count = len(place.keypoints)
+    _require(count <= limits.MAXIMUM_KEYPOINTS, f"place: {count} keypoints, at most {limits.MAXIMUM_KEYPOINTS}")
+    _check_shape(place.keypoints, (count, limits.KEYPOINT_AXES[place.channel]), "place: keypoints")
+    within = bool((np.abs(place.keypoints) <= MAXIMUM_KEYPOINT_M).all())
+    _require(within, f"place: a keypoint is not within {MAXIMUM_KEYPOINT_M:g} m")
+    _check_shape(place.descriptors, (count, CODE_BYTES), "place: descriptors")
     _require(place.descriptors.dtype == np.uint8, f"place: descriptors are {place.descriptors.dtype}, not bytes")
-
-
-def _check_word_place(place: WordPlace, _: Packet) -> None:
-    _check_described(place)
-    _check_shape(place.words, (len(place.keypoints),), "place: words")
-    _require(place.words.dtype == np.uint16, f"place: words are {place.words.dtype}, not 16-bit numbers")
-
-
-def _check_map_tile(tile: MapTile, _: Packet) -> None:
-    sized = limits.MINIMUM_RESOLUTION_M <= tile.resolution_m <= limits.MAXIMUM_RESOLUTION_M
-    bounds = f"{limits.MINIMUM_RESOLUTION_M:g}..{limits.MAXIMUM_RESOLUTION_M:g}"
-    _require(sized, f"map tile: a resolution of {tile.resolution_m} m, not in {bounds}")
-    within = abs(tile.column) <= limits.MAXIMUM_TILE and abs(tile.row) <= limits.MAXIMUM_TILE
-    _require(within, f"map tile: ({tile.column}, {tile.row}) is not within {limits.MAXIMUM_TILE} tiles")
-    _check_shape(tile.cells, (limits.TILE_CELLS, limits.TILE_CELLS), "map tile: cells")
-    _require(tile.cells.dtype == np.uint8, f"map tile: cells are {tile.cells.dtype}, not bytes")
-    _require(int(tile.cells.max()) <= Occupancy.OCCUPIED, "map tile: a cell is neither unknown, free nor occupied")
 
 
 def _check_tag_sighting(sighting: TagSighting, _: Packet) -> None:
@@ -193,21 +181,6 @@ def _check_fix(fix: KeyscanFix, _: Packet) -> None:
     _require(is_near, f"fix: the antenna is not within {limits.MAXIMUM_ANTENNA_M:g} m of the robot")
 
 
-def _check_described(place: Place | WordPlace) -> None:
-    _check_count(place.id.number, "place: number")
-    _check_count(place.first, "place: first")
-    _check_count(place.last, "place: last")
-    _require(place.first <= place.last, f"place: first = {place.first} is after last = {place.last}")
-    within = place.first <= place.id.number <= place.last
-    _require(within, f"place: number = {place.id.number} is not in {place.first}..{place.last}")
-    check_name(place.detector_version, "place: detector version")
-    count = len(place.keypoints)
-    _require(count <= limits.MAXIMUM_KEYPOINTS, f"place: {count} keypoints, at most {limits.MAXIMUM_KEYPOINTS}")
-    _check_shape(place.keypoints, (count, limits.KEYPOINT_AXES[place.channel]), "place: keypoints")
-    within = bool((np.abs(place.keypoints) <= MAXIMUM_KEYPOINT_M).all())
-    _require(within, f"place: a keypoint is not within {MAXIMUM_KEYPOINT_M:g} m")
-
-
 def _check_correction(correction: Correction, _: Packet) -> None:
     _check_count(correction.version, "correction: version")
     _check_count(correction.map_index, "correction: map index")
@@ -226,7 +199,8 @@ def _check_detector_update(update: DetectorUpdate, _: Packet) -> None:
     _check_count(file.format, "detector update: format")
     within = 0 < file.size <= limits.MAXIMUM_NETWORK_BYTES
     _require(within, f"detector update: a file of {file.size} bytes, not of 1..{limits.MAXIMUM_NETWORK_BYTES}")
-    _check_digest(file.sha256, "detector update: sha256")
+    sized = len(file.sha256) == limits.DIGEST_BYTES
+    _require(sized, f"detector update: sha256 has {len(file.sha256)} bytes, not {limits.DIGEST_BYTES}")
 
 
 _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
@@ -234,8 +208,6 @@ _CHECKS: dict[type, Callable[[Any, Packet], None]] = {
     Keyscan: _check_keyscan,
     Constraint: _check_constraint,
     Place: _check_place,
-    WordPlace: _check_word_place,
-    MapTile: _check_map_tile,
     TagSighting: _check_tag_sighting,
     KeyscanFix: _check_fix,
     Correction: _check_correction,
@@ -250,11 +222,6 @@ def _check_pose(pose: FloatArray, what: str, maximum_angle_rad: float = FULL_TUR
     within = abs(x) <= limits.MAXIMUM_COORDINATE_M and abs(y) <= limits.MAXIMUM_COORDINATE_M
     _require(within, f"{what}: not within {limits.MAXIMUM_COORDINATE_M:g} m")
     _require(abs(theta) <= maximum_angle_rad, f"{what}: the angle is beyond {maximum_angle_rad:.4f} rad")
-
-
-def _check_digest(digest: bytes, what: str) -> None:
-    sized = len(digest) == limits.DIGEST_BYTES
-    _require(sized, f"{what} has {len(digest)} bytes, not {limits.DIGEST_BYTES}")
 
 
 def _check_shape(array: NDArray[Any], shape: tuple[int, ...], what: str) -> None:

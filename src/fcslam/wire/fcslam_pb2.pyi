@@ -26,7 +26,7 @@ CONSTRAINT_KIND_ODOMETRY: ConstraintKind
 CONSTRAINT_KIND_CLOSURE: ConstraintKind
 
 class Packet(_message.Message):
-    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "word_place", "map_tile", "tag_sighting", "keyscan_fix", "correction", "acknowledgement", "detector_update")
+    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "tag_sighting", "keyscan_fix", "correction", "acknowledgement", "detector_update")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     ROBOT_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
@@ -36,8 +36,6 @@ class Packet(_message.Message):
     KEYSCAN_FIELD_NUMBER: _ClassVar[int]
     CONSTRAINT_FIELD_NUMBER: _ClassVar[int]
     PLACE_FIELD_NUMBER: _ClassVar[int]
-    WORD_PLACE_FIELD_NUMBER: _ClassVar[int]
-    MAP_TILE_FIELD_NUMBER: _ClassVar[int]
     TAG_SIGHTING_FIELD_NUMBER: _ClassVar[int]
     KEYSCAN_FIX_FIELD_NUMBER: _ClassVar[int]
     CORRECTION_FIELD_NUMBER: _ClassVar[int]
@@ -52,14 +50,12 @@ class Packet(_message.Message):
     keyscan: Keyscan
     constraint: Constraint
     place: Place
-    word_place: WordPlace
-    map_tile: MapTile
     tag_sighting: TagSighting
     keyscan_fix: KeyscanFix
     correction: Correction
     acknowledgement: Acknowledgement
     detector_update: DetectorUpdate
-    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., word_place: _Optional[_Union[WordPlace, _Mapping]] = ..., map_tile: _Optional[_Union[MapTile, _Mapping]] = ..., tag_sighting: _Optional[_Union[TagSighting, _Mapping]] = ..., keyscan_fix: _Optional[_Union[KeyscanFix, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., detector_update: _Optional[_Union[DetectorUpdate, _Mapping]] = ...) -> None: ...
+    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., tag_sighting: _Optional[_Union[TagSighting, _Mapping]] = ..., keyscan_fix: _Optional[_Union[KeyscanFix, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., detector_update: _Optional[_Union[DetectorUpdate, _Mapping]] = ...) -> None: ...
 
 class Pose(_message.Message):
     __slots__ = ("x_m", "y_m", "theta_rad")
@@ -96,14 +92,12 @@ class Laser(_message.Message):
     def __init__(self, beam_count: _Optional[int] = ..., angle_min_rad: _Optional[float] = ..., angle_increment_rad: _Optional[float] = ..., max_range_m: _Optional[float] = ..., t_base_laser: _Optional[_Union[Pose, _Mapping]] = ...) -> None: ...
 
 class Detector(_message.Message):
-    __slots__ = ("channel", "version", "vocabulary")
+    __slots__ = ("channel", "version")
     CHANNEL_FIELD_NUMBER: _ClassVar[int]
     VERSION_FIELD_NUMBER: _ClassVar[int]
-    VOCABULARY_FIELD_NUMBER: _ClassVar[int]
     channel: Channel
     version: str
-    vocabulary: bytes
-    def __init__(self, channel: _Optional[_Union[Channel, str]] = ..., version: _Optional[str] = ..., vocabulary: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, channel: _Optional[_Union[Channel, str]] = ..., version: _Optional[str] = ...) -> None: ...
 
 class Keyscan(_message.Message):
     __slots__ = ("number", "stamp", "count", "ranges", "laser", "beams", "sweep")
@@ -164,38 +158,6 @@ class Place(_message.Message):
     keypoints: bytes
     descriptors: bytes
     def __init__(self, number: _Optional[int] = ..., channel: _Optional[_Union[Channel, str]] = ..., detector_version: _Optional[str] = ..., first: _Optional[int] = ..., last: _Optional[int] = ..., count: _Optional[int] = ..., keypoints: _Optional[bytes] = ..., descriptors: _Optional[bytes] = ...) -> None: ...
-
-class WordPlace(_message.Message):
-    __slots__ = ("number", "channel", "detector_version", "first", "last", "count", "keypoints", "words")
-    NUMBER_FIELD_NUMBER: _ClassVar[int]
-    CHANNEL_FIELD_NUMBER: _ClassVar[int]
-    DETECTOR_VERSION_FIELD_NUMBER: _ClassVar[int]
-    FIRST_FIELD_NUMBER: _ClassVar[int]
-    LAST_FIELD_NUMBER: _ClassVar[int]
-    COUNT_FIELD_NUMBER: _ClassVar[int]
-    KEYPOINTS_FIELD_NUMBER: _ClassVar[int]
-    WORDS_FIELD_NUMBER: _ClassVar[int]
-    number: int
-    channel: Channel
-    detector_version: str
-    first: int
-    last: int
-    count: int
-    keypoints: bytes
-    words: bytes
-    def __init__(self, number: _Optional[int] = ..., channel: _Optional[_Union[Channel, str]] = ..., detector_version: _Optional[str] = ..., first: _Optional[int] = ..., last: _Optional[int] = ..., count: _Optional[int] = ..., keypoints: _Optional[bytes] = ..., words: _Optional[bytes] = ...) -> None: ...
-
-class MapTile(_message.Message):
-    __slots__ = ("resolution_m", "column", "row", "cells")
-    RESOLUTION_M_FIELD_NUMBER: _ClassVar[int]
-    COLUMN_FIELD_NUMBER: _ClassVar[int]
-    ROW_FIELD_NUMBER: _ClassVar[int]
-    CELLS_FIELD_NUMBER: _ClassVar[int]
-    resolution_m: float
-    column: int
-    row: int
-    cells: bytes
-    def __init__(self, resolution_m: _Optional[float] = ..., column: _Optional[int] = ..., row: _Optional[int] = ..., cells: _Optional[bytes] = ...) -> None: ...
 
 class TagSighting(_message.Message):
     __slots__ = ("number", "family", "tag", "t_base_tag", "information")

@@ -31,16 +31,6 @@ KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}
 """Coordinates of a keypoint; a camera sees how high it is, too."""
 BYTES_PER_AXIS = 2
 
-BYTES_PER_WORD = 2
-
-TILE_CELLS = 256
-"""Cells along each side of a map tile."""
-BYTES_PER_TILE = TILE_CELLS * TILE_CELLS // 4
-MAXIMUM_TILE = 2**15
-"""Number of a tile along an axis; at 5 cm it is 400 km away."""
-MINIMUM_RESOLUTION_M = 0.001
-MAXIMUM_RESOLUTION_M = 10.0
-
 MAXIMUM_TAG = 4095
 """Number of a tag; the largest family has 2320."""
 

@@ -1,7 +1,7 @@
 """A packet: one record in the envelope that orders and addresses it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from fcslam.records import (
@@ -12,10 +12,8 @@ from fcslam.records import (
     Keyscan,
     KeyscanFix,
     LaserModel,
-    MapTile,
     Place,
     TagSighting,
-    WordPlace,
 )
 
 
@@ -26,8 +24,6 @@ class PacketKind(StrEnum):
     KEYSCAN = "keyscan"
     CONSTRAINT = "constraint"
     PLACE = "place"
-    WORD_PLACE = "word_place"
-    MAP_TILE = "map_tile"
     TAG_SIGHTING = "tag_sighting"
     KEYSCAN_FIX = "keyscan_fix"
     CORRECTION = "correction"
@@ -50,8 +46,6 @@ class Hello:
     detector_versions: Mapping[Channel, str]
     floor: str = ""
     """Floor of the building that the session maps, the same in all hellos of an epoch; empty: not named."""
-    vocabularies: Mapping[Channel, bytes] = field(default_factory=dict)
-    """SHA-256 of the vocabulary of each channel whose places are sent as words; of some of ``detector_versions``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,19 +67,7 @@ class DetectorUpdate:
     file: DetectorFile
 
 
-Body = (
-    Hello
-    | Keyscan
-    | Constraint
-    | Place
-    | WordPlace
-    | MapTile
-    | TagSighting
-    | KeyscanFix
-    | Correction
-    | Acknowledgement
-    | DetectorUpdate
-)
+Body = Hello | Keyscan | Constraint | Place | TagSighting | KeyscanFix | Correction | Acknowledgement | DetectorUpdate
 
 
 @dataclass(frozen=True, slots=True)

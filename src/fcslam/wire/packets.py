@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError
 
 from fcslam.errors import PacketError
-from fcslam.records import Channel, Place, WordPlace
+from fcslam.records import Channel, Place
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire import limits
 from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS, read_channel
@@ -58,7 +58,7 @@ class SizedPacket(NamedTuple):
         """By which its traffic is counted."""
         body = self.packet.body
         kind, _ = CODEC_OF_TYPE[type(body)]
-        return Label(self.packet.robot, kind, body.channel if isinstance(body, Place | WordPlace) else None)
+        return Label(self.packet.robot, kind, body.channel if isinstance(body, Place) else None)
 
 
 def measure(packet: Packet) -> SizedPacket:
@@ -96,8 +96,7 @@ def read_label(data: bytes) -> Label:
     """
     message, kind = _parse(data)
     check_name(message.robot, "robot")
-    described = kind in (PacketKind.PLACE, PacketKind.WORD_PLACE)
-    return Label(message.robot, kind, read_channel(getattr(message, kind).channel) if described else None)
+    return Label(message.robot, kind, read_channel(message.place.channel) if kind is PacketKind.PLACE else None)
 
 
 def unpacked_size(data: bytes) -> int:

@@ -1,4 +1,4 @@
-"""Lossless streams of ranges, keypoints, descriptors, words and map cells: differences, deflated by zlib.
+"""Lossless streams of ranges, keypoints and descriptors: differences, deflated by zlib.
 
 A stream is deflated if that is shorter than its plain bytes. The receiver tells the two apart by the length, because it
 knows how many numbers to expect. No stream can hold more numbers.
@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
 from fcslam.records import CODE_BYTES, Codes
-from fcslam.wire.limits import BYTES_PER_AXIS, BYTES_PER_RANGE, BYTES_PER_TILE, BYTES_PER_WORD, TILE_CELLS
+from fcslam.wire.limits import BYTES_PER_AXIS, BYTES_PER_RANGE
 
 RangeCodes = NDArray[np.uint16]
 KeypointCodes = NDArray[np.int16]
-Words = NDArray[np.uint16]
 
 _RAW: Final = -15
 """Window of zlib's raw format, without a header and a checksum."""
@@ -84,28 +83,6 @@ def unpack_descriptors(data: bytes, count: int) -> Codes:
     for bit in range(1, _BITS):
         bits[bit] ^= bits[like[bit]] ^ opposite[bit]
     return np.packbits(bits.T, axis=1)
-
-
-def pack_words(words: Words) -> bytes:
-    """Encode words (N,)."""
-    return _deflate(_high_and_low(words))
-
-
-def unpack_words(data: bytes, count: int) -> Words:
-    """Inverse of ``pack_words``: ``count`` words, shape (count,)."""
-    return _from_high_and_low(_inflate(data, BYTES_PER_WORD * count, "place: words"))
-
-
-def pack_cells(cells: NDArray[np.uint8]) -> bytes:
-    """Encode the cells of a map tile (256, 256): 0 unknown, 1 free, 2 occupied."""
-    fours = cells.reshape(-1, 4)
-    return _deflate((fours << np.arange(0, 8, 2, dtype=np.uint8)).sum(axis=1, dtype=np.uint8).tobytes())
-
-
-def unpack_cells(data: bytes) -> NDArray[np.uint8]:
-    """Inverse of ``pack_cells``: shape (256, 256)."""
-    fours = np.frombuffer(_inflate(data, BYTES_PER_TILE, "map tile: cells"), np.uint8)[:, None]
-    return (fours >> np.arange(0, 8, 2, dtype=np.uint8) & 3).astype(np.uint8).reshape(TILE_CELLS, TILE_CELLS)
 
 
 def _high_and_low(numbers: NDArray[np.uint16]) -> bytes:

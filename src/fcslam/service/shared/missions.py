@@ -15,7 +15,7 @@ from fcslam.errors import InputError
 from fcslam.mission.mission_store import MissionStore
 from fcslam.service.intake import Intake, SessionState
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, check_words, locked, sweep
+from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, locked, sweep
 from fcslam.service.shared.agents import RobotLimit, SharedAgents
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SharedDetectors, fetch_folder, fetched
 from fcslam.service.shared.instance import Hooks, Instance
@@ -176,7 +176,6 @@ class SharedMissions:
 
     def create(self, name: str) -> None:
         """As in ``Missions``."""
-        check_words(name, self._config.fleet)
         check_name(name, "mission")
         number = self._registry.create(name)
         MissionStore(MissionTables(self._server, number)).configure(self._config)
@@ -229,7 +228,6 @@ class SharedMissions:
                     folder.path.mkdir(parents=True, exist_ok=True)
                 store = MissionStore(MissionTables(self._server, known.number))
                 settings = store.configure(self._config).fleet
-                check_words(name, settings)
                 agents = SharedAgents(self._server, known.number, self._robots, time.monotonic)
                 intake = Intake(store, time.monotonic, time.time, self.detectors.announced, settings.claims, agents)
                 self._opened[name] = SharedMission(known.number, folder, self._server, store, intake, self._instance)
