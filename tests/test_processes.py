@@ -15,16 +15,12 @@ from fcslam.robot.frontend import RobotConfig
 from fcslam.sources import open_source
 
 
-def let_semaphores_fail(monkeypatch, number):
-    def refuse(*_args, **_kwargs):
-        raise OSError(number, "refused")
-
-    monkeypatch.setattr(synchronize.SemLock, "__init__", refuse)
-
-
 @pytest.fixture
 def no_semaphores(monkeypatch):
-    let_semaphores_fail(monkeypatch, errno.EACCES)
+    def refuse(*_args, **_kwargs):
+        raise OSError(errno.EACCES, "refused")
+
+    monkeypatch.setattr(synchronize.SemLock, "__init__", refuse)
 
 
 def verify():
@@ -51,12 +47,6 @@ def test_robots_side_by_side(no_semaphores, logs):
 def test_a_single_robot_does_without(no_semaphores, logs):
     with side_by_side(2)([open_source(logs[0])], RobotConfig()) as (legs,):
         assert list(legs)[-1].tracks
-
-
-def test_too_many_open_files_say_so(monkeypatch):
-    let_semaphores_fail(monkeypatch, errno.EMFILE)
-    with pytest.raises(OSError, match="refused"):
-        worker_process()
 
 
 FREEING = """

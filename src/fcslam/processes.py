@@ -1,41 +1,36 @@
 """Child processes, all of which end with the process that started them, however that ends.
 
-There are four kinds: a ``Child`` is a module of fcslam that runs as a program and reports events; ``run_module`` waits
-for one; a ``worker_pool`` calls functions; ``start_copy`` runs a task in a copy of this process, and a ``Stream`` also
-gets what the task sends. Only this module starts processes.
+A ``Child`` is a module of fcslam that runs as a program and reports events; ``run_module`` waits for one; a
+``worker_pool`` calls functions; ``start_copy`` runs a task in a copy of this process, and a ``Stream`` also gets what
+the task sends. Only this module starts processes.
 """
 
 import ctypes
-import errno
 import json
 import logging
 import multiprocessing
 import os
 import pickle
-import queue
 import signal
 import subprocess
 import sys
 import threading
-import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
+from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
 from multiprocessing.process import BaseProcess
-from typing import Any, Final, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from fcslam.errors import FcslamError, InputError
 
 NICENESS = 10
 """Increment of the niceness of a task in a copy of this process: what the process itself does goes first."""
 
-_NO_SEMAPHORES = frozenset({errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.ENOSYS})
-"""Errors of a host that has none, and not of a process with too many open files, for example."""
-
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
-_ALLOCATOR: Final = {_M_TRIM_THRESHOLD: 1 << 17, _M_MMAP_THRESHOLD: 1 << 17, _M_ARENA_MAX: 2}
-"""Options of glibc's ``mallopt``: the default sizes in bytes, which then do not adapt, and the number of heaps."""
+Task = Callable[[], None]
+Start = Callable[[Task], BaseProcess]
+"""Starts a task beside this process, as ``start_copy`` does."""
 
 _log = logging.getLogger(__name__)
 Item = TypeVar("Item")
@@ -52,8 +47,9 @@ class Child:
     def __init__(self, command: Sequence[str]) -> None:
         # Unbuffered: what a dead child did not read must not turn up when the pipe is closed.
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
         self._stdin, self._stdout = self._process.stdin, self._process.stdout
-        assert self._stdin is not None
         os.set_blocking(self._stdin.fileno(), False)
 
     @property
@@ -63,13 +59,11 @@ class Child:
 
     def send(self, line: str = "") -> None:
         """Write a line to its stdin, unless it has ended or does not read."""
-        assert self._stdin is not None
         with suppress(OSError, ValueError):
             self._stdin.write(f"{line}\n".encode())
 
     def events(self) -> Iterator[tuple[str, Any]]:
         """Its events with their contents, until it ends."""
-        assert self._stdout is not None
         with self._stdout as lines:
             for line in lines:
                 try:
@@ -81,8 +75,7 @@ class Child:
                     yield event
 
     def wait(self) -> int:
-        """Wait for its end; returns its exit code."""
-        assert self._stdin is not None
+        """End its stdin and wait for its end; returns its exit code."""
         with suppress(OSError):
             self._stdin.close()
         return self._process.wait()
@@ -92,7 +85,6 @@ class Child:
 
         ``patience_s``: wait for its end, and kill it if it takes longer.
         """
-        assert self._stdin is not None
         with suppress(OSError):
             self._stdin.close()
         self._process.terminate()
@@ -139,23 +131,17 @@ def worker_pool(niceness: int = 0, is_copy: bool = False) -> Executor:
 
 
 def semaphore(count: int) -> Any:
-    """A semaphore that this process shares with its copies.
-
-    Raises:
-        InputError: the host gives processes no semaphores.
-    """
+    """A semaphore that this process shares with its copies; raises as ``worker_pool``."""
     with _needing_semaphores():
         return _copying().BoundedSemaphore(count)
 
 
-def start_copy(task: Callable[[], None], niceness: int = NICENESS) -> "Background":
+def start_copy(task: Task, niceness: int = NICENESS) -> BaseProcess:
     """Run a task in a copy of this process. It sees everything as it is now, and nothing that it changes is seen here.
 
     Threads do not exist in the copy; OpenCV must have one thread (``cv2.setNumThreads``), or the copy waits for others.
     """
-    process: BaseProcess = multiprocessing.get_context("fork").Process(
-        target=_run_copy, args=(task, niceness), daemon=True
-    )
+    process = multiprocessing.get_context("fork").Process(target=_run_copy, args=(task, niceness), daemon=True)
     process.start()
     return process
 
@@ -179,11 +165,11 @@ class Stream(Generic[Item]):
         """
         while True:
             try:
-                item, error, place = pickle.loads(self._receiving.recv_bytes())
+                item, error = pickle.loads(self._receiving.recv_bytes())
             except (EOFError, OSError):
                 break
             if error is not None:
-                raise error from _RemoteError(place)
+                raise error
             yield item
         self._process.join()
         if self._process.exitcode:
@@ -199,35 +185,13 @@ class Stream(Generic[Item]):
         self._receiving.close()
 
 
-class _RemoteError(Exception):
-    """The traceback of an error in another process."""
-
-
-class Background(Protocol):
-    """A task that runs beside this process."""
-
-    @property
-    def exitcode(self) -> int | None:
-        """None while it runs, 0 if it succeeded."""
-
-    def terminate(self) -> None:
-        """End it now, if it still runs."""
-
-    def join(self) -> None:
-        """Wait for its end."""
-
-
-Start = Callable[[Callable[[], None]], Background]
-"""Starts a task beside this process."""
-
-
 class RecurringTask:
     """A task that runs beside this process again and again, for at most a share of the time."""
 
     def __init__(self, start: Start, clock: Callable[[], float], share: float, every_s: float) -> None:
-        """``every_s``: the shortest time between the end of one run and the beginning of the next."""
+        """``every_s``: least time between the end of one run and the beginning of the next."""
         self._start, self._clock, self._share, self._every_s = start, clock, share, every_s
-        self._running: Background | None = None
+        self._running: BaseProcess | None = None
         self._began_s = clock()
         self.due_s = self._began_s
         """When the next run may begin, by the clock."""
@@ -267,11 +231,10 @@ class RecurringTask:
 def keep_memory_trimmed() -> None:
     """Let this process give freed memory back to the system at once, also between memory in use.
 
-    glibc by default keeps a heap for each of many threads, and puts ever longer arrays into them. So a process that
-    runs for days grows by the gaps, although what it uses does not. Other allocators stay as they are. Where long
-    arrays come and go all the time, this costs much CPU: call ``trim_memory`` now and then there.
+    By default, the gaps of glibc's heaps grow in a process that runs for days. Where long arrays come and go all the
+    time, this costs much CPU: call ``trim_memory`` now and then there.
     """
-    for option, value in _ALLOCATOR.items():
+    for option, value in ((-1, 1 << 17), (-3, 1 << 17), (-8, 2)):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX
         _glibc("mallopt", option, value)
 
 
@@ -297,8 +260,6 @@ def _needing_semaphores() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in _NO_SEMAPHORES:
-            raise
         raise InputError(
             f"/dev/shm: more than one process needs semaphores, which cannot be made there ({error}); "
             "mount it writable, with free space"
@@ -320,23 +281,16 @@ def _run_copy(task: Callable[[], None], niceness: int) -> None:
 
 def _run_stream(task: Callable[[Callable[[Item], None]], None], sending: Connection) -> None:
     _exit_with_parent()
-    waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    with ThreadPoolExecutor(1) as sender:  # what the parent does not read yet waits for this thread
 
-    def put(item: Item | None, error: Exception | None = None, place: str = "") -> None:
-        waiting.put(pickle.dumps((item, error, place), pickle.HIGHEST_PROTOCOL))  # which keeps arrays read-only
+        def put(item: Item | None, error: object = None) -> None:
+            # this protocol keeps arrays read-only
+            sender.submit(sending.send_bytes, pickle.dumps((item, error), pickle.HIGHEST_PROTOCOL))
 
-    def send() -> None:
-        while (content := waiting.get()) is not None:
-            sending.send_bytes(content)
-
-    sender = threading.Thread(target=send)
-    sender.start()
-    try:
-        task(put)
-    except Exception as error:
-        put(None, error, traceback.format_exc())
-    waiting.put(None)
-    sender.join()
+        try:
+            task(put)
+        except Exception as error:
+            put(None, ExceptionWithTraceback(error, error.__traceback__))
 
 
 def _exit_with_parent() -> None:

@@ -1,7 +1,7 @@
 """Compiles, or loads from the cache, all code that scans and packets will need, before the first one comes.
 
-Compiling takes half a minute on a machine that has never done it, loading a second or two: no packet should wait for
-that. Made-up robots cross a made-up room; nothing of it reaches any mission.
+Compiling takes half a minute on a machine that has never done it, loading a second or two. Made-up robots cross a
+made-up room; nothing of it reaches any mission.
 """
 
 import gc
@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from multiprocessing.process import BaseProcess
 from typing import Final
 
 import numpy as np
@@ -31,7 +32,7 @@ from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.places.matcher import MatcherConfig
 from fcslam.places.vocabulary import VocabularyConfig
-from fcslam.processes import Background, start_copy
+from fcslam.processes import start_copy
 from fcslam.records import (
     CODE_BYTES,
     PLACE_CHANNELS,
@@ -50,19 +51,12 @@ from fcslam.records import (
 )
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.own_places import OwnPlaces
-from fcslam.wire.limits import KEYPOINT_AXES
 from fcslam.wire.messages import Body, Hello, Packet
-from fcslam.wire.packets import decode, encode, measure
+from fcslam.wire.packets import encode, measure
 from fcslam.wire.quantisation import dequantise, rounded
 
-_STEP_M, _STEPS, _PLACE_EVERY, _AROUND = 0.4, 31, 3, 3
 _EMPTY_SCAN = PointScan(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), np.zeros(2))
-_LANDMARKS = 120
-_DETECTOR = "made-up-1"
-_MOTION = np.diag((1e4, 1e4, 1e5))
-_CLOSURE_AFTER = 15
-"""Keyscans between the ends of a robot's own closure."""
-MADE_UP_LASER = LaserModel(240, -np.pi, 2.0 * np.pi / 240, 20.0)
+_LASER = LaserModel(240, -np.pi, 2.0 * np.pi / 240, 20.0)
 _WALLS = np.array(
     [
         (0.0, 0.0, 16.0, 0.0),
@@ -76,9 +70,7 @@ _WALLS = np.array(
     ]
 )
 """x, y of both ends, metres, in a made-up room."""
-_OTHER_WALLS = 0.95 * _WALLS
-"""In a similar room: a scan of one is near surfaces of the other."""
-ROUND = 60
+_ROUND = 60
 """Made-up scans of one round through the room."""
 _STEPS = 30
 
@@ -97,13 +89,13 @@ def warm_up_matching() -> None:
 def warm_up_searching() -> None:
     """Compile the search of doubtful scans, and packets of keyscans."""
     search(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3), SearchWindow(0.5, 0.1))
-    measure(Packet("r", 0, 0, 0.0, Keyscan(KeyscanId("r", 0), 0.0, dequantise(np.ones(9, np.uint16)))))
+    warm_up_decoding()
 
 
 def warm_up_robot() -> None:
     """Compile submaps, their description, loop closing, and packets of places."""
     robot = RobotFrontend("r", RobotConfig(channels=(Channel.LIDAR,)))
-    for scan in made_up_scans(2 * ROUND):
+    for scan in made_up_scans(2 * _ROUND):
         for packet in robot.process(scan):
             measure(packet)
 
@@ -120,34 +112,33 @@ def warm_up_recognition() -> None:
 
 
 def warm_up_tracking(config: RobotConfig) -> None:
-    """Compile, or load from the cache, all code that the pose of a scan may need.
+    """Compile all code that the pose of a scan may need: a robot drives, is put down elsewhere, and is lost.
 
-    A made-up robot drives around in a room and is put down in another one, so it is lost and searches. Garbage
-    collection would take longer than a scan, so it excludes all objects that are in memory then.
+    Garbage collection would take longer than a scan, so it leaves out all objects that are in memory then.
     """
     frontend = LidarFrontend("warm-up", config.lidar)
     scans = list(made_up_scans(_STEPS, sweep=Sweep(0.0, 0.1)))
     for scan in scans:
         frontend.process(scan)
-    elsewhere = list(made_up_scans(FEWEST_SCANS, _OTHER_WALLS, Sweep(0.0, 0.1)))
-    is_lost(elsewhere, frontend)
+    similar_room = 0.95 * _WALLS  # a scan of one is near surfaces of the other
+    is_lost(list(made_up_scans(FEWEST_SCANS, similar_room, Sweep(0.0, 0.1))), frontend)
     point_scan(scans[0].ranges_m, scans[0].laser)  # of a laser that states no beam times
     gc.collect()
     gc.freeze()
 
 
 def warm_up_decoding() -> None:
-    """Compile what the intake needs: decoding."""
-    for data in _packets():
-        decode(data)
+    """Compile what the intake needs."""
+    measure(Packet("r", 0, 0, 0.0, Keyscan(KeyscanId("r", 0), 0.0, dequantise(np.ones(9, np.uint16)))))
 
 
 def warm_up_fleet() -> None:
     """Compile what the worker needs: decode, match, verify, solve, decide, map."""
     vocabulary = VocabularyConfig(train_batch=2, leaf_capacity=32)
     cloud = Cloud(FleetConfig(matcher=MatcherConfig(small_fleet=0, vocabulary=vocabulary)), seed=0)
-    for data in _packets():
-        cloud.receive(data)
+    for robot in ("a", "b"):
+        for number, body in enumerate(_bodies(robot)):
+            cloud.receive(encode(Packet(robot, 0, number, float(_STEPS), body)))
     result = cloud.finalize()
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
     run_of(result, tracks, (), "", OccupancyConfig(), with_local_maps=False, with_certificates=False)
@@ -170,23 +161,18 @@ def is_cold() -> bool:
 
 
 @contextmanager
-def compiling(processes: int) -> Iterator[Sequence[Background]]:
-    """Run all warm-ups on several cores; begins as soon as the first two scans need no compiler.
+def compiling(processes: int) -> Iterator[Sequence[BaseProcess]]:
+    """Run the warm-ups of the first two scans, then the others beside this block, in copies of this process.
 
-    The first one runs in this process. The others run in copies of it, which are given, fill the cache and end with the
-    context. Without a cache nothing does: no process can hand over what it compiled. With one process nothing runs
-    beside this one, which compiles the rest when it needs it.
+    The copies fill the cache and end with the context. Without a cache, or with one process, this process compiles the
+    rest when it needs it.
     """
-    here, matching, *others = WARM_UPS
-    copies: list[Background] = []
+    scanning, matching, *others = WARM_UPS
+    scanning()
+    matching()
     count = 0 if uncached() else min(processes - 1, len(others))
+    copies = [start_copy(partial(_compile, others[k::count]), niceness=0) for k in range(count)]
     try:
-        if count:
-            copies.append(start_copy(partial(_compile, [matching]), niceness=0))
-        here()
-        if count:
-            copies[0].join()
-            copies += [start_copy(partial(_compile, others[k::count]), niceness=0) for k in range(count)]
         yield copies
     finally:
         for copy in copies:
@@ -200,71 +186,50 @@ def _compile(runs: Sequence[Callable[[], None]]) -> None:
         run()
 
 
-def _packets() -> Iterator[bytes]:
-    """Two robots that cross the room in opposite directions, one after the other."""
+def _bodies(robot: str) -> Iterator[Body]:
+    """A robot that crosses the room, with places of both channels; other robots see the same."""
     rng = np.random.default_rng(0)
-    along = np.arange(_STEPS) * _STEP_M
-    there = np.column_stack((2.0 + along, np.full(_STEPS, 4.0), np.zeros(_STEPS)))
-    back = np.column_stack((14.0 - along, np.full(_STEPS, 4.5), np.full(_STEPS, np.pi)))
-    codes = rng.integers(0, 256, (_LANDMARKS, CODE_BYTES), dtype=np.uint8)
-    landmarks = rng.uniform((0.0, 0.0, 0.0), (16.0, 9.0, 2.0), (_LANDMARKS, 3))
-    for start_s, robot, poses in ((0.0, "there", there), (100.0, "back", back)):
-        for number, body in enumerate(_bodies(robot, start_s, poses, landmarks, codes)):
-            yield encode(Packet(robot, 0, number, start_s + _STEPS, body))
-
-
-def _bodies(robot: str, start_s: float, poses: FloatArray, landmarks: FloatArray, codes: np.ndarray) -> Iterator[Body]:
-    yield Hello(robot, 0, (MADE_UP_LASER,), dict.fromkeys(PLACE_CHANNELS, _DETECTOR))
+    codes = rng.integers(0, 256, (120, CODE_BYTES), dtype=np.uint8)
+    landmarks = rng.uniform((0.0, 0.0, 0.0), (16.0, 9.0, 2.0), (len(codes), 3))
+    poses = np.column_stack((2.0 + 0.4 * np.arange(_STEPS), np.full(_STEPS, 4.0), np.zeros(_STEPS)))
+    yield Hello(robot, 0, (_LASER,), dict.fromkeys(PLACE_CHANNELS, "made-up-1"))
     for k, pose in enumerate(poses):
-        yield Keyscan(KeyscanId(robot, k), start_s + k, made_up_ranges(pose))
+        yield Keyscan(KeyscanId(robot, k), float(k), made_up_ranges(pose))
         if k:
             yield _constraint(robot, poses, k - 1, k, ConstraintKind.ODOMETRY)
-        anchor = k - _AROUND
-        if anchor >= _AROUND and anchor % _PLACE_EVERY == 0:
-            yield from (_place(robot, channel, anchor, poses[anchor], landmarks, codes) for channel in PLACE_CHANNELS)
-    yield _constraint(robot, poses, 0, _CLOSURE_AFTER, ConstraintKind.CLOSURE)
+        if k >= 6 and k % 3 == 0:
+            seen = np.hypot(*(landmarks[:, :2] - poses[k - 3, :2]).T) < 8.0
+            x, y = se2.transform(se2.inverse(poses[k - 3]), landmarks[seen, :2]).T
+            for channel, keypoints in ((Channel.LIDAR, (x, y)), (Channel.CAMERA, (x, y, landmarks[seen, 2]))):
+                described = frozen(np.column_stack(keypoints), np.float32), frozen(codes[seen], np.uint8)
+                yield Place(KeyscanId(robot, k - 3), channel, "made-up-1", k - 6, k, *described)
+    yield _constraint(robot, poses, 0, _STEPS // 2, ConstraintKind.CLOSURE)
 
 
 def _constraint(robot: str, poses: FloatArray, i: int, j: int, kind: ConstraintKind) -> Constraint:
-    return Constraint(robot, i, j, kind, frozen(se2.between(poses[i], poses[j])), frozen(_MOTION))
-
-
-def _place(
-    robot: str, channel: Channel, anchor: int, pose: FloatArray, landmarks: FloatArray, codes: np.ndarray
-) -> Place:
-    seen = np.hypot(*(landmarks[:, :2] - pose[:2]).T) < 8.0
-    keypoints = np.column_stack((se2.transform(se2.inverse(pose), landmarks[seen, :2]), landmarks[seen, 2]))
-    return Place(
-        KeyscanId(robot, anchor),
-        channel,
-        _DETECTOR,
-        anchor - _AROUND,
-        anchor + _AROUND,
-        frozen(keypoints[:, : KEYPOINT_AXES[channel]], np.float32),
-        frozen(codes[seen], np.uint8),
-    )
+    return Constraint(robot, i, j, kind, frozen(se2.between(poses[i], poses[j])), frozen(np.diag((1e4, 1e4, 1e5))))
 
 
 def made_up_scans(count: int, walls: FloatArray = _WALLS, sweep: Sweep | None = None) -> Iterator[LaserScan]:
     """Scans of a robot that drives around in a room with ``walls``, shape (W, 4), about 0.5 m at a time."""
-    turn = 2.0 * np.pi / ROUND
+    turn = 2.0 * np.pi / _ROUND
     for k in range(count):
         x, y = 8.0 + 5.0 * np.cos(k * turn), 4.5 + 2.0 * np.sin(k * turn)
         heading = float(np.arctan2(2.0 * np.cos(k * turn), -5.0 * np.sin(k * turn)))
         pose = np.array((x, y, heading))
-        yield LaserScan(float(k), made_up_ranges(pose, walls), MADE_UP_LASER, frozen(pose), sweep)
+        yield LaserScan(float(k), made_up_ranges(pose, walls), _LASER, frozen(pose), sweep)
 
 
 def made_up_ranges(pose: FloatArray, walls: FloatArray = _WALLS) -> Ranges:
     """Distance to the nearest wall along every beam, as it is sent, shape (B,)."""
-    angles = pose[2] + MADE_UP_LASER.angles_rad()
+    angles = pose[2] + _LASER.angles_rad()
     beams = np.stack((np.cos(angles), np.sin(angles)), axis=-1)[:, np.newaxis]
     starts, along = walls[:, :2] - pose[:2], walls[:, 2:] - walls[:, :2]
     with np.errstate(divide="ignore", invalid="ignore"):
         facing = _cross(beams, along)
         distance, share = _cross(starts, along) / facing, _cross(starts, beams) / facing
     hit = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
-    return rounded(np.where(hit, distance, np.inf).min(axis=1), MADE_UP_LASER.max_range_m)
+    return rounded(np.where(hit, distance, np.inf).min(axis=1), _LASER.max_range_m)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -5,7 +5,6 @@ psycopg is an extra of its own, so it is imported when a server is used.
 
 import os
 import re
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,6 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import parse_qsl, unquote, urlencode, urlsplit, urlunsplit
 
+from fcslam.config import one_line
 from fcslam.errors import StoreError
 from fcslam.storage.row_store import Result, StoreTable
 
@@ -28,8 +28,6 @@ ANSWER_S: Final = 10.0
 """A statement that takes longer fails: the server, or the way to it, is gone."""
 MOST_CONNECTIONS: Final = 8
 """Most connections of one process to the server."""
-_CONNECT_S: Final = 3
-_LOOK_EVERY_S: Final = 0.5
 _SCHEMES: Final = ("postgresql", "postgres")
 _MARK: Final = re.compile(r"\?|:([a-z_]+)")
 
@@ -56,18 +54,13 @@ class Postgres:
         self._name = name
         self._idle: list[_Connection] = []
         self._places = threading.Semaphore(MOST_CONNECTIONS)
-        self._busy: dict[_Connection, float] = {}
-        """Since when each connection waits for the server."""
-        self._schemas: dict[_Connection, str] = {}
-        """The schema that statements on each connection mean."""
-        self._closing = threading.Event()
-        with self._translated(), self._connected():
-            pass
-        threading.Thread(target=self._watch, name="answers of PostgreSQL", daemon=True).start()
+        self._is_closing = False
+        with self._translated():
+            self._idle.append(self._connected())
 
     def close(self) -> None:
         """Close all connections that nobody uses."""
-        self._closing.set()
+        self._is_closing = True
         while self._idle:
             self._idle.pop().close()
 
@@ -91,9 +84,7 @@ class Postgres:
         """All rows that a query of a schema finds. If the connection turns out to be lost, it asks again."""
 
         def ask(connection: "_Connection") -> tuple["_Connection", list[tuple[Any, ...]]]:
-            if self._schemas.get(connection) != schema:
-                connection.execute(f"SET search_path TO {schema}".encode())
-                self._schemas[connection] = schema
+            connection.execute(f"SET search_path TO {schema}".encode())
             return connection, PostgresTransaction(connection).execute(statement, values).fetchall()
 
         with self._places, self._translated():
@@ -102,7 +93,7 @@ class Postgres:
         return found
 
     def _retried(self, work: Callable[["_Connection"], Result]) -> Result:
-        """Do with a connection what changes nothing; with another one if it is lost. It stays busy if that succeeds."""
+        """Do with a connection what changes nothing; with another one if it is lost."""
         import psycopg
 
         until = time.monotonic() + RETRY_S
@@ -110,7 +101,6 @@ class Postgres:
             connection = None
             try:
                 connection = self._idle.pop() if self._idle else self._connected()
-                self._busy[connection] = time.monotonic()
                 return work(connection)
             except BaseException as error:
                 if connection is not None:
@@ -127,7 +117,12 @@ class Postgres:
         return psycopg.connect(
             self.url,
             autocommit=True,
-            connect_timeout=_CONNECT_S,
+            connect_timeout=3,
+            # nothing else ends the wait for a server behind a broken network
+            tcp_user_timeout=int(1000 * (ANSWER_S + RETRY_S)),
+            keepalives_idle=int(ANSWER_S),
+            keepalives_interval=1,
+            keepalives_count=5,
             application_name=f"fcslam {self._name}",
             options=f"-c statement_timeout={ANSWER_S:.0f}s -c idle_in_transaction_session_timeout={RETRY_S:.0f}s "
             "-c client_min_messages=error",
@@ -136,24 +131,13 @@ class Postgres:
     def _give_back(self, connection: "_Connection") -> None:
         from psycopg.pq import TransactionStatus
 
-        self._busy.pop(connection, None)
         if not connection.closed and connection.info.transaction_status is not TransactionStatus.IDLE:
             with suppress(Exception):  # it is closed then
                 connection.execute("ROLLBACK")
-        if connection.closed or self._closing.is_set():
-            self._schemas.pop(connection, None)
+        if connection.closed or self._is_closing:
             connection.close()
         else:
             self._idle.append(connection)
-
-    def _watch(self) -> None:
-        """Hang up on a server that does not answer: nothing else ends the wait for one behind a broken network."""
-        while not self._closing.wait(_LOOK_EVERY_S):
-            now = time.monotonic()
-            for connection, since in list(self._busy.items()):
-                if now > since + ANSWER_S + RETRY_S:
-                    with suppress(Exception), socket.socket(fileno=os.dup(connection.fileno())) as line:
-                        line.shutdown(socket.SHUT_RDWR)
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
@@ -162,15 +146,10 @@ class Postgres:
 
         try:
             yield
-        except psycopg.errors.InsufficientPrivilege as error:
-            raise StoreError(
-                f"{self.url}: the role has too few rights ({_text(error)}); "
-                "GRANT CREATE ON DATABASE, or name another role"
-            ) from error
-        except psycopg.OperationalError as error:
-            raise StoreError(f"{self.url}: cannot be used ({_text(error)})") from error
         except psycopg.Error as error:
-            raise StoreError(f"{self.url}: cannot be read or written ({_text(error)})") from error
+            rights = isinstance(error, psycopg.errors.InsufficientPrivilege)
+            advice = "; the role has too few rights: GRANT CREATE ON DATABASE, or name another role" if rights else ""
+            raise StoreError(f"{self.url}: cannot be used ({one_line(str(error))}){advice}") from error
 
 
 class PostgresTransaction:
@@ -182,7 +161,7 @@ class PostgresTransaction:
     def execute(
         self, statement: str, values: Sequence[object] | Mapping[str, object] = ()
     ) -> "psycopg.Cursor[tuple[Any, ...]]":
-        """Execute a statement."""
+        """As in ``Transaction``."""
         return self._connection.execute(_translate(statement), _plain(values), binary=True)
 
     def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
@@ -252,10 +231,6 @@ def _is_lost(error: "psycopg.OperationalError") -> bool:
     """Whether a server may be back soon: it was reached before, or nobody listens now."""
     state = error.sqlstate
     return state is None or state.startswith(("08", "57P"))
-
-
-def _text(error: BaseException) -> str:
-    return " ".join(str(error).split())
 
 
 @lru_cache(maxsize=1000)
