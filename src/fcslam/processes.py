@@ -29,7 +29,9 @@ NICENESS = 10
 """Increment of the niceness of a task in a copy of this process: what the process itself does goes first."""
 
 Task = Callable[[], None]
-Start = Callable[[Task], BaseProcess]
+Background = BaseProcess
+"""A task that runs beside this process."""
+Start = Callable[[Task], Background]
 """Starts a task beside this process, as ``start_copy`` does."""
 
 _log = logging.getLogger(__name__)
@@ -136,7 +138,7 @@ def semaphore(count: int) -> Any:
         return _copying().BoundedSemaphore(count)
 
 
-def start_copy(task: Task, niceness: int = NICENESS) -> BaseProcess:
+def start_copy(task: Task, niceness: int = NICENESS) -> Background:
     """Run a task in a copy of this process. It sees everything as it is now, and nothing that it changes is seen here.
 
     Threads do not exist in the copy; OpenCV must have one thread (``cv2.setNumThreads``), or the copy waits for others.
@@ -191,7 +193,7 @@ class RecurringTask:
     def __init__(self, start: Start, clock: Callable[[], float], share: float, every_s: float) -> None:
         """``every_s``: least time between the end of one run and the beginning of the next."""
         self._start, self._clock, self._share, self._every_s = start, clock, share, every_s
-        self._running: BaseProcess | None = None
+        self._running: Background | None = None
         self._began_s = clock()
         self.due_s = self._began_s
         """When the next run may begin, by the clock."""

@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from multiprocessing.process import BaseProcess
 from typing import Final
 
 import numpy as np
@@ -32,7 +31,7 @@ from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import build_submap
 from fcslam.places.matcher import MatcherConfig
 from fcslam.places.vocabulary import VocabularyConfig
-from fcslam.processes import start_copy
+from fcslam.processes import Background, start_copy
 from fcslam.records import (
     CODE_BYTES,
     PLACE_CHANNELS,
@@ -161,7 +160,7 @@ def is_cold() -> bool:
 
 
 @contextmanager
-def compiling(processes: int) -> Iterator[Sequence[BaseProcess]]:
+def compiling(processes: int) -> Iterator[Sequence[Background]]:
     """Run the warm-ups of the first two scans, then the others beside this block, in copies of this process.
 
     The copies fill the cache and end with the context. Without a cache, or with one process, this process compiles the
