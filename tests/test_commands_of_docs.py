@@ -289,7 +289,7 @@ def test_two_robots_and_a_service_as_the_pages_show_them(logs, desk, capsys, mon
 def test_the_pages_of_runs_are_served(desk, monkeypatch):
     """Up to the server; tests/cli/test_show.py looks at a page and presses Ctrl-C."""
     served: list[object] = []
-    monkeypatch.setattr("fcslam.page.viewer.run_viewer", lambda app, _: served.append(app))
+    monkeypatch.setattr("fcslam.page.routes.serve_page", lambda app, _: served.append(app))
     monkeypatch.setenv("DISPLAY", "")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert main(["map", "robot1.clf", "-o", "runs/sample", "--quiet"]) == 0

@@ -1,5 +1,6 @@
 """The page in a real browser, in front of a real service: what a person sees, clicks and types."""
 
+import asyncio
 import gzip
 import json
 import os
@@ -298,7 +299,7 @@ def test_a_report_tells_of_days_of_changes_and_of_accuracy(browser, tmp_path):
     plan = {"drawing": "M-2 -2L2 -2z", "maps": [{"map": 0, "aligned": True, "deviations": [moved]}]}
     (folder / "plan.json").write_text(json.dumps(plan))
     with ShownRun(folder) as shown:
-        (tmp_path / "report.html").write_text(report_html(shown))
+        (tmp_path / "report.html").write_text(asyncio.run(report_html(shown)))
     with (
         closing(browser.new_context(timezone_id="UTC", locale="en-GB")) as context,
         closing(context.new_page()) as page,

@@ -83,7 +83,7 @@ def test_a_report_is_one_file_and_replaces_another_only_if_told(run, tmp_path, c
 def test_a_browser_opens_where_there_is_a_display_and_nobody_forbids_it(run, monkeypatch):
     opened = []
     monkeypatch.setattr(show.webbrowser, "open", opened.append)
-    monkeypatch.setattr("fcslam.page.viewer.run_viewer", lambda *_: None)
+    monkeypatch.setattr("fcslam.page.routes.serve_page", lambda *_: None)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     for display, options in (("", []), (":0", []), (":0", ["--no-open"]), ("", ["--open"])):
         monkeypatch.setenv("DISPLAY", display)

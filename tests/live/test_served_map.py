@@ -15,8 +15,8 @@ from fcslam.errors import CloudError, InputError, SourceError
 from fcslam.live.served_map import fetch_maps
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_stem, map_yaml, pgm_bytes
 from fcslam.mission.localization import read_map
+from fcslam.page.routes import run_page
 from fcslam.page.shown_run import ShownRun
-from fcslam.page.viewer import ReadOnly, viewer_app
 from fcslam.runs import RobotTrajectory, Run
 from fcslam.wire.fleet_client import MapClient
 from fcslam.wire.http_transport import Server
@@ -46,7 +46,7 @@ def run_of(maps):
 def served(folder):
     """The address of a viewer of the run folder."""
     with ShownRun(folder) as shown, socket.create_server(("127.0.0.1", 0)) as listening:
-        server = uvicorn.Server(uvicorn.Config(viewer_app(ReadOnly(shown)), log_level="critical", ws="none"))
+        server = uvicorn.Server(uvicorn.Config(run_page(shown), log_level="critical", ws="none"))
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()
         while thread.is_alive() and not server.started:

@@ -24,8 +24,8 @@ from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_byt
 from fcslam.mission.mission_file import as_stored, mission_bytes
 from fcslam.page import ASSETS, MODULES
 from fcslam.page.report import MOST_TILES, report_html
+from fcslam.page.routes import run_page
 from fcslam.page.shown_run import ShownRun
-from fcslam.page.viewer import ReadOnly, viewer_app
 from fcslam.records import Channel, ClosureStatus, Edit, Reason, ReasonCode, Veto
 from fcslam.runs import ClosureRow, Join, Metric, RobotTrajectory, Run
 from fcslam.service.http.app import PREFIX
@@ -87,7 +87,7 @@ def shown(run, tmp_path):
 
 def ask(shown, *paths, method="GET", host="127.0.0.1:80"):
     async def answers():
-        transport = httpx.ASGITransport(app=viewer_app(ReadOnly(shown)))
+        transport = httpx.ASGITransport(app=run_page(shown))
         async with httpx.AsyncClient(transport=transport, base_url=f"http://{host}") as client:
             return [await client.request(method, path) for path in paths]
 
@@ -121,7 +121,7 @@ def test_a_finished_run_answers_as_the_service_does(shown):
 
 
 def test_every_route_of_viewers_answers_for_a_finished_run(shown):
-    app = viewer_app(ReadOnly(shown))
+    app = run_page(shown)
     paths = [route.path for route in iter_route_contexts(app.routes)]
     plain = [path for path in paths if "{" not in path and not path.endswith("/events")]
     assert f"{PREFIX}/closures" in plain
@@ -170,7 +170,7 @@ class Elements(HTMLParser):
 
 
 def test_a_report_holds_all_that_the_page_asks_for_and_asks_nobody(shown):
-    elements = Elements(report_html(shown))
+    elements = Elements(asyncio.run(report_html(shown)))
     assert not elements.of("link")
     assert not any({"src", "href"} & set(attributes) for _, attributes, _ in elements.found)
     (data, texts), (module, script) = elements.of("script")
@@ -204,7 +204,7 @@ def test_a_report_holds_all_that_the_page_asks_for_and_asks_nobody(shown):
 def test_a_report_of_a_huge_map_holds_coarse_tiles_or_none(run, tmp_path, resolution_m, zoom):
     replace(run, map_files=files("map", 400, resolution_m)).save(tmp_path / "run")
     with ShownRun(tmp_path / "run") as shown:
-        ((_, texts), _) = Elements(report_html(shown)).of("script")
+        ((_, texts), _) = Elements(asyncio.run(report_html(shown))).of("script")
     responses = json.loads(texts)
     assert json.loads(responses["texts"]["maps"])[0]["zoom"] == zoom
     assert len(responses["pictures"]) <= MOST_TILES
@@ -214,7 +214,7 @@ def test_a_report_of_what_cannot_be_shown_says_what(run, tmp_path):
     (closure,) = run.closures
     replace(run, closures=(replace(closure, T_i_j=np.full(3, np.nan)),)).save(tmp_path / "run")
     with ShownRun(tmp_path / "run") as shown, pytest.raises(InputError, match="closures"):
-        report_html(shown)
+        asyncio.run(report_html(shown))
 
 
 def test_what_cannot_be_read_of_a_run_is_not_there(shown, tmp_path):
@@ -232,7 +232,7 @@ def test_a_report_of_a_run_with_a_link_says_so(shown, tmp_path, name):
     place.unlink(missing_ok=True)
     place.symlink_to(tmp_path / "private")
     with pytest.raises(InputError, match=place.name):
-        report_html(shown)
+        asyncio.run(report_html(shown))
 
 
 def test_a_run_without_trajectories_has_no_archive_of_them(tmp_path):
@@ -247,7 +247,7 @@ CHROMIUM = shutil.which("chromium")
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
 def test_a_browser_shows_a_report_from_a_file(shown, tmp_path):
-    (tmp_path / "report.html").write_text(report_html(shown))
+    (tmp_path / "report.html").write_text(asyncio.run(report_html(shown)))
     options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
     command = [CHROMIUM, *options, "--virtual-time-budget=3000", "--dump-dom", f"file://{tmp_path / 'report.html'}"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0)

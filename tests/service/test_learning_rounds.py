@@ -4,8 +4,8 @@ import pytest
 
 from fcslam.errors import InputError
 from fcslam.learning.federated.history import ROUNDS_FILE, RoundReport, write_rows
-from fcslam.service import summaries
-from fcslam.service.summaries import MOST_ROUNDS, read_rounds
+from fcslam.service.http import fleet
+from fcslam.service.http.fleet import read_rounds
 
 
 def test_the_table_of_a_training_is_read(tmp_path):
@@ -13,7 +13,7 @@ def test_the_table_of_a_training_is_read(tmp_path):
         1, "light-a", ("anna", "bob"), {"cleo": "too late"}, {"triplet": 0.5}, {"mma_3px": 0.25}, 0.4, released=True
     )
     second = RoundReport(2, "light-b", ("bob",), losses={"triplet": float("nan")})
-    assert summaries.ROUNDS_FILE == ROUNDS_FILE
+    assert fleet.ROUNDS_FILE == ROUNDS_FILE
     write_rows(tmp_path / ROUNDS_FILE, [first.row(), second.row()])
     one, two = read_rounds(tmp_path)
     assert (one.round, one.version, one.released, one.robots) == (1, "light-a", True, ["anna", "bob"])
@@ -33,9 +33,3 @@ def test_a_damaged_table_is_refused(tmp_path, content):
     (tmp_path / ROUNDS_FILE).write_bytes(content)
     with pytest.raises(InputError, match="not a table of rounds"):
         read_rounds(tmp_path)
-
-
-def test_a_table_without_end_is_cut(tmp_path):
-    head, line = "round,version,released,robots,left_out", "1,a,0,r,"
-    (tmp_path / ROUNDS_FILE).write_text("\n".join([head, *[line] * (MOST_ROUNDS + 5)]))
-    assert len(read_rounds(tmp_path)) == MOST_ROUNDS

@@ -15,7 +15,6 @@ from fcslam.page.shown_run import ShownRun
 from fcslam.service import map_layers
 from fcslam.service.http.responses import MapLayer
 from fcslam.service.map_layers import layers_of, map_shapes, walls_of
-from fcslam.service.summaries import all_sessions, map_summaries
 from tests.mission.test_map_changes import write_run
 
 PLAN = {
@@ -56,7 +55,6 @@ def points(path):
 
 def test_a_map_names_its_layers(run, tmp_path):
     assert {*layers_of(run, 0)} == {"plan", "tags", "quality", "changes"}
-    assert map_summaries(run)[0].layers == layers_of(run, 0)
     write_run(tmp_path / "one-day", (0,))
     with ShownRun(tmp_path / "one-day") as shown:
         assert layers_of(shown, 0) == []
@@ -125,7 +123,6 @@ def test_a_trajectory_without_poses_is_no_session_of_a_map(tmp_path):
     second.write_text("")
     with ShownRun(folder) as shown:
         assert layers_of(shown, 0) == map_shapes(shown, 0, MapLayer.CHANGES) == []
-        assert [session.map for session in all_sessions(shown)] == [0, None]
     first.write_text("")
     with ShownRun(folder) as shown:
         assert map_shapes(shown, 0, MapLayer.CHANGES) == []
@@ -178,4 +175,4 @@ def test_the_direction_of_walls_is_that_of_the_drawn_line(tmp_path):
     occupancy = OccupancyMap(cells, 0.05, (0.0, 0.0))
     (tmp_path / "map.pgm").write_bytes(pgm_bytes(occupancy))
     (tmp_path / "map.yaml").write_text(map_yaml(occupancy, "map.pgm"))
-    assert walls_of(tmp_path, 0).direction_rad == pytest.approx(0.2, abs=0.01)
+    assert walls_of(tmp_path, 0)["direction_rad"] == pytest.approx(0.2, abs=0.01)

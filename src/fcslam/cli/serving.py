@@ -24,10 +24,9 @@ from fcslam.learning.settings import DETECTOR
 from fcslam.processes import Child, module_command
 from fcslam.service.audit_log import AuditFile
 from fcslam.service.http.authentication import Authenticator, read_tokens
-from fcslam.service.http.events import EventStream
 from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
-from fcslam.service.http.state import ServiceState
+from fcslam.service.http.state import EventStream, ServiceState
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import Missions
 from fcslam.service.shared.audit_table import AuditTable

@@ -1,5 +1,6 @@
 """`fcslam show`: the page of `fcslam serve` on a finished run, or as one file."""
 
+import asyncio
 import os
 import sys
 import webbrowser
@@ -44,14 +45,14 @@ def show(
     _check(run)
     with ShownRun(run) as shown:
         if html is not None:
-            content = report_html(shown).encode()
+            content = asyncio.run(report_html(shown)).encode()
             try:
                 write_file(html, content)
             except OSError as error:
                 raise InputError(f"{html}: cannot be written ({error})") from error
             typer.echo(f"report of {run}: {html} ({len(content) / 1e6:.1f} MB)")
             return
-        from fcslam.page.viewer import ReadOnly, run_viewer, viewer_app
+        from fcslam.page.routes import run_page, serve_page
 
         with listen(HOST, port) as listening:
             address = f"http://{HOST}:{listening.getsockname()[1]}/"
@@ -59,7 +60,7 @@ def show(
             has_display = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
             if open_browser or (open_browser is None and has_display):
                 webbrowser.open(address)
-            run_viewer(viewer_app(ReadOnly(shown)), listening)
+            serve_page(run_page(shown), listening)
 
 
 def _check(run: Path) -> None:

@@ -1,4 +1,4 @@
-"""The page over a finished run as one file: it holds what the page asks for, and asks nobody."""
+"""The page over a finished run as one file: it holds what the service answers to the page, and asks nobody."""
 
 import base64
 import gzip
@@ -6,34 +6,27 @@ import hashlib
 import itertools
 import json
 import math
-import os
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Any
-from urllib.parse import quote, unquote
+from urllib.parse import quote
 
-from fcslam.config import StrictModel
+import httpx
+from fastapi import FastAPI
+from fastapi.params import Depends as Dependency
+
 from fcslam.errors import InputError
-from fcslam.maps.exports import export_map
-from fcslam.maps.occupancy_map import OccupancyMap, map_stem
-from fcslam.maps.tiles import WORLD_M, finest_zoom, tile_png
+from fcslam.maps.occupancy_map import map_stem
+from fcslam.maps.tiles import WORLD_M
 from fcslam.page import ASSETS, MODULES
 from fcslam.records import ClosureStatus
-from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES, open_run
-from fcslam.service.map_layers import map_shapes, walls_of
-from fcslam.service.summaries import (
-    all_edits,
-    all_sessions,
-    fleet_summary,
-    map_joins,
-    map_separations,
-    map_summaries,
-    newest_closures,
-    run_of,
-    trajectories_zip,
-)
+from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES
+from fcslam.service.http.app import PREFIX, VIEWER_ROUTERS
+from fcslam.service.http.authentication import Role
+from fcslam.service.http.problems import add_handlers
+from fcslam.service.http.state import EventStream
 from fcslam.service.viewed_mission import ViewedMission
-from fcslam.untrusted import read_bytes, read_text
 
 MOST_CLOSURES = 5000
 """Largest number of closures of each status that the page asks for."""
@@ -45,107 +38,89 @@ SCRIPT, STYLE = '<script type="module" src="page.js"></script>', '<link rel="sty
 """Elements of the page that the file holds instead."""
 
 
-def report_html(mission: ViewedMission) -> str:
-    """The page of a finished run, with all that it shows."""
-    maps = {} if mission.run_folder is None else dict(open_run(mission.run_folder).maps)
-    zooms = {k: _zoom(occupancy, MOST_TILES // len(maps)) for k, occupancy in maps.items()}
-    try:
-        pictures = _pictures(mission, maps, zooms)
-        return _page({"texts": _texts(mission, zooms), "pictures": pictures, "files": _files(mission, maps)})
-    except (OSError, ValueError) as error:
-        raise InputError(f"the run has files that cannot be shown ({error})") from error
+@dataclass(frozen=True, slots=True)
+class ReadOnly:
+    """A ``ViewerState`` without roles: whoever reaches it may read, and nobody may change anything."""
+
+    mission: ViewedMission
+    events: EventStream = field(default_factory=EventStream)
+    read_only: bool = True
+    learning: None = None
+
+    def require(self, *_: Role) -> list[Dependency]:
+        """Nothing."""
+        return []
+
+    def admits(self, *_: object) -> bool:
+        """Everybody."""
+        return True
 
 
-def _texts(mission: ViewedMission, zooms: Mapping[int, int]) -> dict[str, str]:
-    """Responses of the service to the page, by path. Maps have tiles down to ``zooms``."""
-    sessions, maps = all_sessions(mission), map_summaries(mission)
-    texts = {
-        "fleet": _json(fleet_summary(mission, read_only=True, may_edit=False)),
-        "maps": _json(one.model_copy(update={"zoom": zooms.get(one.map, 0)}) for one in maps),
-        "separations": _json(map_separations(mission)),
-        "joins": _json(map_joins(mission)),
-        "robots": _json(sessions),
-        "edits": _json(all_edits(mission)),
-        "learning": "[]",
-    }
-    for k, layer in [(one.map, layer) for one in maps for layer in one.layers]:
-        texts[f"maps/{k}/layers/{layer}"] = _json(map_shapes(mission, k, layer))
-    for status in ClosureStatus:
-        try:
-            texts[f"closures?status={status}&limit={MOST_CLOSURES}"] = newest_closures(
-                run_of(mission), status, MOST_CLOSURES
-            ).decode()
-        except ValueError as error:
-            raise InputError(f"the run has closures that cannot be shown ({error})") from error
-    if mission.run_folder is not None:
-        texts |= {f"maps/{k}/walls": _json(walls_of(mission.run_folder, k)) for k in zooms}
-        located = (quote(one.session, safe="") for one in sessions if one.T_map_base)
-        for path in (METRICS, CONFIG, *(f"{TRAJECTORIES}/{name}.tum" for name in located)):
-            texts[path] = read_text(mission.run_folder / unquote(path), mission.run_folder)
-        certificate = mission.run_folder / f"{QUALITY}.json"
-        if certificate.is_file():
-            texts[certificate.name] = read_text(certificate, mission.run_folder)
-    return texts
+def viewer_app(state: ReadOnly) -> FastAPI:
+    """The routes of viewers."""
+    app = FastAPI(title="fcslam", openapi_url=None, redirect_slashes=False)
+    add_handlers(app)
+    for make in VIEWER_ROUTERS:
+        app.include_router(make(state), prefix=PREFIX)
+    return app
 
 
-def _pictures(mission: ViewedMission, maps: Mapping[int, OccupancyMap], zooms: Mapping[int, int]) -> dict[str, str]:
-    folder = mission.run_folder
-    return {
-        f"maps/{k}/tiles/{zoom}/{column}/{row}.png": base64.b64encode(
-            tile_png(folder, map_stem(k), zoom, column, row)
-        ).decode()
-        for k, occupancy in maps.items()
-        if folder is not None
-        for zoom, column, row in _tiles(occupancy, zooms[k])
-    }
+async def report_html(mission: ViewedMission) -> str:
+    """The page of a finished run, with all that it shows.
+
+    Raises:
+        InputError: the run has files that cannot be shown.
+    """
+    transport = httpx.ASGITransport(viewer_app(ReadOnly(mission)), raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url=f"http://localhost{PREFIX}/") as client:
+
+        async def get(path: str) -> bytes:
+            answer = await client.get(path)
+            if answer.status_code != httpx.codes.OK:
+                raise InputError(f"the run has files that cannot be shown: {path}: {answer.json()['error']}")
+            return answer.content
+
+        robots, maps = json.loads(await get("robots")), json.loads(await get("maps"))
+        drawn = [one for one in maps if one["extent"] is not None]
+        for one in maps:
+            one["zoom"] = _zoom(one["extent"], one["zoom"], MOST_TILES // len(drawn)) if one in drawn else 0
+        found = set() if mission.run_folder is None else {path.name for path in mission.run_folder.iterdir()}
+        texts = ["fleet", "separations", "joins", "robots", "edits", "learning"]
+        texts += [f"maps/{one['map']}/layers/{layer}" for one in maps for layer in one["layers"]]
+        texts += [f"closures?status={status}&limit={MOST_CLOSURES}" for status in ClosureStatus]
+        texts += [f"maps/{one['map']}/walls" for one in drawn]
+        texts += [f"{TRAJECTORIES}/{quote(one['session'], safe='')}.tum" for one in robots if one["T_map_base"]]
+        texts += sorted(found & {METRICS, CONFIG, f"{QUALITY}.json"})
+        files = [f"maps/{one['map']}.png" for one in drawn if f"{map_stem(one['map'])}.png" in found]
+        files += [f"maps/{one['map']}.{suffix}" for one in drawn for suffix in ("zip", "svg")]
+        files += [f"maps/{one['map']}.tif" for one in drawn if one["georeferenced"]]
+        files += sorted(found & {POSE_GRAPH}) + [f"{TRAJECTORIES}.zip"] * bool(robots)
+        tiles = [path for one in drawn for path in _tiles(one)]
+        responses = {
+            "texts": {path: (await get(path)).decode() for path in texts} | {"maps": json.dumps(maps)},
+            "pictures": {path: _base64(await get(path)) for path in tiles},
+            "files": {path: _base64(gzip.compress(await get(path), mtime=0)) for path in files},
+        }
+    return _page(responses)
 
 
-def _files(mission: ViewedMission, maps: Collection[int]) -> dict[str, str]:
-    """What the page downloads, compressed with gzip and in base64, by path."""
-    if mission.run_folder is None:
-        return {}
-    named = {f"maps/{k}.png": f"{map_stem(k)}.png" for k in maps}
-    named[POSE_GRAPH] = POSE_GRAPH
-    files = {path: mission.run_folder / name for path, name in named.items()}
-    contents = {path: read_bytes(file, mission.run_folder) for path, file in files.items() if os.path.lexists(file)}
-    if (archive := trajectories_zip(mission.run_folder)) is not None:
-        contents[f"{TRAJECTORIES}.zip"] = archive
-    for k, suffix in itertools.product(maps, ("zip", "svg", "tif")):
-        if (exported := export_map(mission.run_folder, k, suffix)) is not None:
-            contents[f"maps/{k}.{suffix}"] = exported
-    return {path: base64.b64encode(gzip.compress(content, mtime=0)).decode() for path, content in contents.items()}
-
-
-def _json(content: StrictModel | Iterable[StrictModel]) -> str:
-    whole = (
-        content.model_dump(mode="json")
-        if isinstance(content, StrictModel)
-        else [one.model_dump(mode="json") for one in content]
-    )
-    return json.dumps(whole, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-
-
-def _zoom(occupancy: OccupancyMap, most: int) -> int:
+def _zoom(extent: list[float], finest: int, most: int) -> int:
     """The deepest zoom at which a map has at most this many tiles; -1: it is too large even for zoom 0."""
-    finest = finest_zoom(occupancy.resolution_m)
-    counts = itertools.accumulate(math.prod(map(len, _covered(occupancy, zoom))) for zoom in range(finest + 1))
+    counts = itertools.accumulate(math.prod(map(len, _covered(extent, zoom))) for zoom in range(finest + 1))
     return sum(1 for count in counts if count <= most) - 1
 
 
-def _tiles(occupancy: OccupancyMap, deepest: int) -> Iterator[tuple[int, int, int]]:
-    """Zoom, column and row of all tiles that show part of a map."""
-    for zoom in range(deepest + 1):
-        columns, rows = _covered(occupancy, zoom)
-        for column, row in itertools.product(columns, rows):
-            yield zoom, column, row
+def _tiles(one: dict[str, Any]) -> Iterator[str]:
+    for zoom in range(one["zoom"] + 1):
+        for column, row in itertools.product(*_covered(one["extent"], zoom)):
+            yield f"maps/{one['map']}/tiles/{zoom}/{column}/{row}.png"
 
 
-def _covered(occupancy: OccupancyMap, zoom: int) -> tuple[range, range]:
-    side_m, (height, width) = WORLD_M / 2**zoom, occupancy.cells.shape
-    x, y = occupancy.origin_xy
+def _covered(extent: list[float], zoom: int) -> tuple[range, range]:
+    """Columns and rows of the tiles that show part of a map."""
+    side_m, (left, low, right, high) = WORLD_M / 2**zoom, extent
     columns, rows = (
-        range(math.floor(low / side_m), math.ceil((low + count * occupancy.resolution_m) / side_m))
-        for low, count in ((x, width), (y, height))
+        range(math.floor(first / side_m), math.ceil(last / side_m)) for first, last in ((left, right), (low, high))
     )
     return columns, rows
 
@@ -178,4 +153,8 @@ def _asset(name: str) -> str:
 
 def _hash(content: str) -> str:
     """The one script or style that a browser may use."""
-    return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
+    return f"'sha256-{_base64(hashlib.sha256(content.encode()).digest())}'"
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()

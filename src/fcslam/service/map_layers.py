@@ -17,7 +17,7 @@ from fcslam.mission.map_changes import changes_of
 from fcslam.mission.mission_file import check_packets, stored_mission
 from fcslam.mission.mission_store import MissionStore
 from fcslam.runs import QUALITY, Run
-from fcslam.service.http.responses import MapLayer, MapShape, WallDirection
+from fcslam.service.http.responses import MapLayer, MapShape
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 from fcslam.untrusted import LimitError, read_bytes, read_text
 
@@ -70,7 +70,7 @@ def map_shapes(mission: ViewedMission, k: int, layer: MapLayer) -> list[MapShape
         raise InputError(f"{_FILES[layer]} cannot be shown ({error})") from error
 
 
-def walls_of(folder: Path, k: int) -> WallDirection:
+def walls_of(folder: Path, k: int) -> dict[str, float]:
     """The direction of the walls of map ``k`` of a run folder, which has it.
 
     Raises:
@@ -81,7 +81,7 @@ def walls_of(folder: Path, k: int) -> WallDirection:
         pgm, description = read_bytes(folder / f"{stem}.pgm", folder), read_text(folder / f"{stem}.yaml", folder)
     except (OSError, ValueError) as error:
         raise InputError(f"{stem} cannot be read ({error})") from error
-    return WallDirection(direction_rad=wall_direction(parse_map(stem, pgm, description)))
+    return {"direction_rad": wall_direction(parse_map(stem, pgm, description))}
 
 
 @lru_cache(maxsize=8)  # each takes all packets of the mission; a run that is replaced is another one

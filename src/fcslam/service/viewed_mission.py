@@ -48,6 +48,12 @@ class ViewedMission(Protocol):
         """How far the packets of all robots are."""
 
 
+def run_of(mission: ViewedMission) -> Run:
+    """The newest run, without its maps; an empty one before the first one is written."""
+    folder = mission.run_folder
+    return Run({}) if folder is None else viewed_run(folder)
+
+
 _MOST_KEPT: Final = 4
 """Missions whose runs are kept in memory."""
 _keeping = threading.Lock()

@@ -17,9 +17,8 @@ from fcslam.records import Channel
 from fcslam.service.audit_log import AuditFile
 from fcslam.service.http.app import create_app
 from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
-from fcslam.service.http.events import EventStream
 from fcslam.service.http.limits import RateLimit
-from fcslam.service.http.state import ServiceState
+from fcslam.service.http.state import EventStream, ServiceState
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import Missions
 from fcslam.service.worker import Worker
@@ -82,7 +81,7 @@ class Desk:
             missions,
             Authenticator(tokens),
             RateLimit(lambda: self.now, burst=2.0**21),
-            EventStream(),
+            EventStream(beat_s=0.0),
             AuditFile(root / "audit.jsonl", lambda: 1e9 + self.now),
         )
         self.app = create_app(self.state)

@@ -2,13 +2,11 @@
 
 import pytest
 
-from fcslam.service.http import viewers
 from tests.service.http.desk import ENTRIES, Desk
 
 
 @pytest.fixture
-def desk(tmp_path, monkeypatch):
-    monkeypatch.setattr(viewers, "BEAT_S", 0.0)
+def desk(tmp_path):
     with Desk(tmp_path / "data") as opened:
         yield opened
 

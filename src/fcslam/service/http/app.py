@@ -12,14 +12,16 @@ from starlette.responses import Response
 
 import fcslam
 from fcslam.service.http.decisions import decision_router
+from fcslam.service.http.events import event_router
+from fcslam.service.http.fleet import fleet_router
 from fcslam.service.http.joint_maps import joint_map_router
+from fcslam.service.http.maps import map_router
 from fcslam.service.http.middleware import LocalNames, NamedMissions, UnauthenticatedLimit, Watch
 from fcslam.service.http.missions import mission_router
 from fcslam.service.http.operations import operations_router
 from fcslam.service.http.problems import add_handlers
 from fcslam.service.http.robots import detector_router, robot_router
 from fcslam.service.http.state import ServiceState
-from fcslam.service.http.viewers import event_router, fleet_router, map_router
 
 PREFIX = "/api/v1"
 VIEWER_ROUTERS = (fleet_router, map_router, event_router)

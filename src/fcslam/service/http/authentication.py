@@ -29,6 +29,10 @@ class Role(StrEnum):
     """Reads everything, and decides about missions."""
 
 
+VIEWERS = Role.VIEWER, Role.ADMIN
+"""Roles that read everything."""
+
+
 class Identity(NamedTuple):
     """The client of a request."""
 

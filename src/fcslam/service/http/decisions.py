@@ -15,13 +15,13 @@ from fcslam.errors import InputError, StoreError
 from fcslam.records import Change, Undo
 from fcslam.service.detectors import LONGEST_FILE_BYTES
 from fcslam.service.http.authentication import Role
+from fcslam.service.http.events import LOOK_S
+from fcslam.service.http.fleet import edit_summary
 from fcslam.service.http.limits import json_body, read_body, read_json
-from fcslam.service.http.responses import DetectorVersion, EditSummary, Finalized, content, refusals
+from fcslam.service.http.responses import DetectorSummary, EditSummary, Finalized, content, refusals
 from fcslam.service.http.robots import NETWORK
 from fcslam.service.http.state import ServiceState
-from fcslam.service.summaries import edit_summary
 
-LOOK_EVERY_S = 0.1
 LEAST_FREE_BYTES = 8 * 2**20
 """A disk with less is full: neither a result nor the reason for a failure can be written reliably."""
 
@@ -66,7 +66,7 @@ def decision_router(state: ServiceState) -> APIRouter:
                     507,
                     f"{free} bytes are free on the disk; free some, and the worker writes result {number} by itself",
                 )
-            await asyncio.sleep(LOOK_EVERY_S)
+            await asyncio.sleep(LOOK_S)
         raise HTTPException(503, "the mission was closed; the result will be there when it is open again")
 
     @router.post("/edits", status_code=201, openapi_extra=json_body(NewEdit), responses=refusals(400, 404, 409, 413))
@@ -87,11 +87,11 @@ def decision_router(state: ServiceState) -> APIRouter:
         openapi_extra={"requestBody": {"required": True, **content(NETWORK)}},
         responses=refusals(400, 413),
     )
-    async def announce_detector(request: Request) -> DetectorVersion:
+    async def announce_detector(request: Request) -> DetectorSummary:
         """Add a network (ONNX) and announce it to every robot that has a camera and uses another one."""
         content = await read_body(request, LONGEST_FILE_BYTES)
         file = await run_in_threadpool(state.detectors.announce, content)
-        return DetectorVersion(channel=file.channel, version=file.version)
+        return DetectorSummary(channel=file.channel, version=file.version, announced=True)
 
     return router
 
@@ -104,4 +104,4 @@ def _edit(state: ServiceState, author: str, content: Change | Undo) -> EditSumma
         raise
     except InputError as error:
         raise HTTPException(404, str(error)) from error
-    return edit_summary(mission.edit(content, author), {})
+    return edit_summary(mission.edit(content, author))

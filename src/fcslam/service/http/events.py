@@ -1,61 +1,54 @@
-"""Events of the cloud for subscribers: the newest of each kind first, then all new ones."""
+"""The stream of events for viewers (server-sent events)."""
 
 import asyncio
-import threading
-from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass
+import json
+import time
+from collections.abc import AsyncIterator
 
-MOST_WAITING = 100
-"""Largest backlog of a slow subscriber, in events; it loses the oldest ones beyond."""
+from fastapi import APIRouter, Request
+from fastapi.responses import StreamingResponse
+
+from fcslam.service.http.authentication import VIEWERS
+from fcslam.service.http.responses import file_of, refusals
+from fcslam.service.http.state import ViewerState
+
+EVENTS = "text/event-stream"
+MOST_STREAMS = 200
+"""Streams at a time: each costs the process a look four times a second. A further one ends the oldest, whose client
+asks again if it is still there."""
+LOOK_S = 0.25
+"""How often something that waits looks again: a stream for events, a request for its result."""
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
-    """One event."""
+def event_router(state: ViewerState) -> APIRouter:
+    """One stream."""
+    router = APIRouter(tags=["viewers"], dependencies=state.require(*VIEWERS), responses=refusals(401, 403, 503))
 
-    kind: str
-    number: int
+    streams: list[object] = []
 
-
-class EventStream:
-    """Events of missions from any thread to watchers in event loops."""
-
-    def __init__(self, current: Callable[[], str] = str) -> None:
-        """``current``: name of the mission that the present request is about, if there are several."""
-        self._current = current
-        self._lock = threading.Lock()
-        self._newest: dict[tuple[str, str], Event] = {}
-        self._watchers: dict[asyncio.Queue[Event], tuple[str, asyncio.AbstractEventLoop]] = {}
-
-    def publish(self, kind: str, number: int, mission: str = "") -> None:
-        """Send an event of a mission to all its subscribers."""
-        event = Event(kind, number)
-        with self._lock:
-            self._newest[mission, kind] = event
-            for queue, (watched, loop) in self._watchers.items():
-                if watched == mission:
-                    loop.call_soon_threadsafe(_put, queue, event)
-
-    def watch(self) -> AsyncIterator[Event]:
-        """Yield the newest event of each kind of the current mission, then each new event."""
-        return self._watch(self._current())
-
-    async def _watch(self, mission: str) -> AsyncIterator[Event]:
-        queue: asyncio.Queue[Event] = asyncio.Queue(MOST_WAITING)
-        with self._lock:
-            for (named, _), event in self._newest.items():
-                if named == mission:
-                    _put(queue, event)
-            self._watchers[queue] = mission, asyncio.get_running_loop()
+    async def lines(request: Request) -> AsyncIterator[str]:
+        mine, said, said_s = object(), dict[str, tuple[int, int]](), time.monotonic()
+        streams.append(mine)
+        del streams[:-MOST_STREAMS]
         try:
-            while True:
-                yield await queue.get()
+            while mine in streams and state.admits(request, *VIEWERS):
+                newest = state.events.newest()
+                news = [(kind, number) for kind, (_, number) in newest.items() if said.get(kind) != newest[kind]]
+                if news or time.monotonic() - said_s >= state.events.beat_s:
+                    said, said_s = newest, time.monotonic()
+                    told = [f"event: {kind}\ndata: {json.dumps({'number': number})}\n\n" for kind, number in news]
+                    yield "".join(told) or ": nothing new\n\n"
+                await asyncio.sleep(LOOK_S)
         finally:
-            with self._lock:
-                del self._watchers[queue]
+            if mine in streams:
+                streams.remove(mine)
 
+    @router.get("/events", **file_of(EVENTS, refused=()))
+    async def get_events(request: Request) -> StreamingResponse:
+        """``live``: there is a new live run; ``finalized``: a result was written. A comment comes at least every 5 s.
 
-def _put(queue: asyncio.Queue[Event], event: Event) -> None:
-    if queue.full():
-        queue.get_nowait()
-    queue.put_nowait(event)
+        The stream ends when the service stops, or when the token is no longer valid.
+        """
+        return StreamingResponse(lines(request), media_type=EVENTS)
+
+    return router

@@ -27,8 +27,7 @@ from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
 from fcslam.service.joint_maps import Exploration, LivePose, ServedJointMaps
 from fcslam.service.map_layers import MOST_LAYER_BYTES
-from fcslam.service.summaries import run_of
-from fcslam.service.viewed_mission import viewed_run
+from fcslam.service.viewed_mission import run_of, viewed_run
 from fcslam.untrusted import read_text
 from fcslam.wire.fleet_replies import Apart, FleetReply, FrontierReply, MapFrontiers, QualityReply, TeammatePose
 

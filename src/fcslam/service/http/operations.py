@@ -10,7 +10,7 @@ from fcslam.errors import StoreError
 from fcslam.service.audit_log import AuditEntry
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.problems import problem
-from fcslam.service.http.responses import Health, Readiness, Unready, file_of, refusals
+from fcslam.service.http.responses import Readiness, file_of, refusals
 from fcslam.service.http.state import ServiceState
 
 LARGEST_BACKLOG = 200
@@ -22,7 +22,7 @@ def operations_router(state: ServiceState) -> APIRouter:
     router = APIRouter(tags=["operations"])
 
     @router.get("/healthz", responses=refusals(503))
-    def get_health() -> Health:
+    def get_health() -> dict[str, str]:
         """200 while the service takes packets and the worker is ready, 503 otherwise."""
         try:
             state.mission.store.applied()
@@ -34,9 +34,9 @@ def operations_router(state: ServiceState) -> APIRouter:
         if not worker.is_ready:
             is_down = "down" if worker.pid is None else "starting"
             raise HTTPException(503, f"the service takes packets, but the worker is {is_down}")
-        return Health()
+        return {"status": "ok"}
 
-    @router.get("/readyz", response_model=Readiness, responses={503: {"model": Unready}})
+    @router.get("/readyz", response_model=Readiness, responses=refusals(503))
     def get_readiness() -> Readiness | JSONResponse:
         """200 while the worker follows what robots send, 503 while it starts or catches up."""
         backlog = state.mission.intake.ready_count() - state.mission.worker.applied

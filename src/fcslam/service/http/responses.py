@@ -2,13 +2,17 @@
 
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from hashlib import sha256
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
+from starlette.requests import Request
+from starlette.responses import Response
 
 from fcslam.config import StrictModel
 from fcslam.records import Channel, ClosureStatus, ReasonCode
 
+_Model = TypeVar("_Model", bound=StrictModel)
 Pose = Annotated[list[float], Field(min_length=3, max_length=3, description="x and y in metres, theta in radians")]
 
 
@@ -16,30 +20,14 @@ class Problem(StrictModel):
     """Why a request is refused."""
 
     error: str = Field(description="what, where, what to do: one line")
-
-
-class PacketProblem(Problem):
-    """Why a batch is refused, and from which of its packets on."""
-
-    index: int | None = Field(None, description="of the refused packet; those before it are stored")
-
-
-class Health(StrictModel):
-    """The service is well."""
-
-    status: Literal["ok"] = "ok"
+    index: int = Field(default=0, description="of the refused packet of a batch; those before it are stored")
+    backlog: int = Field(default=0, description="if a worker is not ready: packets that arrived without effect yet")
 
 
 class Readiness(StrictModel):
     """The worker follows what robots send."""
 
     status: Literal["ready"] = "ready"
-    backlog: int = Field(description="packets that arrived and have no effect yet")
-
-
-class Unready(Problem):
-    """The worker starts or catches up."""
-
     backlog: int = Field(description="packets that arrived and have no effect yet")
 
 
@@ -171,12 +159,6 @@ class LearningRound(StrictModel):
     measures: dict[str, float] = Field(description="of the evaluation, in [0, 1]; empty if the round was not evaluated")
 
 
-class WallDirection(StrictModel):
-    """How a map's walls run."""
-
-    direction_rad: float = Field(description="of most walls, radians from the x axis, in [-pi/4, pi/4)")
-
-
 class MapShape(StrictModel):
     """A shape that is drawn over a map, and its label."""
 
@@ -220,17 +202,12 @@ class MapJoin(StrictModel):
     explanation: str = Field(description="all of this in one line")
 
 
-class DetectorVersion(StrictModel):
+class DetectorSummary(StrictModel):
     """A detector that robots may download."""
 
     channel: Channel
     version: str
-
-
-class DetectorSummary(DetectorVersion):
-    """A detector, and whether it is announced."""
-
-    announced: bool
+    announced: bool = Field(description="whether robots are to use it")
 
 
 class MissionList(StrictModel):
@@ -292,9 +269,21 @@ def file_of(
     *media_types: str, refused: Sequence[int] = (404,), model: dict[str, Any] | None = None, is_tagged: bool = False
 ) -> dict[str, Any]:
     """Arguments of a route that sends a file; ``is_tagged``: a client that has it gets 304."""
-    from starlette.responses import Response  # who writes a report needs the models, and may have no web server
-
     responses = {**refusals(*refused), 200: content(*media_types, model=model)}
     if is_tagged:
         responses[304] = {"description": "as you have it"}
     return {"response_class": Response, "responses": responses}
+
+
+def response_of(model: type[_Model], record: object, **more: object) -> _Model:
+    """A response with the fields of a record that have the same name, and ``more``."""
+    same = {name: getattr(record, name) for name in model.model_fields if name not in more}
+    return model.model_validate({**same, **more})
+
+
+def unless_known(request: Request, body: bytes, media_type: str, **headers: str) -> Response:
+    """An answer whose body is left out if the client says that it has it (RFC 9110, 13.1.2)."""
+    headers = {"ETag": f'"{sha256(body).hexdigest()}"', "Cache-Control": "private, no-cache", **headers}
+    if request.headers.get("if-none-match") == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    return Response(body, media_type=media_type, headers=headers)

@@ -12,7 +12,6 @@ from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import read_body
 from fcslam.service.http.responses import (
     DetectorSummary,
-    PacketProblem,
     PacketRefusal,
     RobotState,
     content,
@@ -51,13 +50,12 @@ def robot_router(state: ServiceState) -> APIRouter:
     """Packets in, acknowledgements and corrections out."""
     router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
     as_robot = state.require(Role.ROBOT)
-    taken = {status: {**refusal, "model": PacketProblem} for status, refusal in refusals(400, 409).items()}
 
     @router.post(
         "/robots/{robot}/packets",
         dependencies=as_robot,
         response_class=Response,
-        responses={**refusals(413, 429, 507), **taken, 200: {**content(MEDIA_TYPE), "headers": _REFUSED}},
+        responses={**refusals(400, 409, 413, 429, 507), 200: {**content(MEDIA_TYPE), "headers": _REFUSED}},
         openapi_extra={"requestBody": content(MEDIA_TYPE)},
     )
     async def send_packets(

@@ -1,7 +1,8 @@
 """State shared by all routes of the HTTP service."""
 
 import asyncio
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -15,7 +16,6 @@ from starlette.types import Scope
 from fcslam.service.audit_log import AuditLog
 from fcslam.service.detectors import DetectorStore
 from fcslam.service.http.authentication import Authenticator, Identity, Role
-from fcslam.service.http.events import EventStream
 from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.missions import Missions, OpenMission
@@ -29,6 +29,26 @@ ANYBODY = "anybody"
 ACTOR = "actor"
 """Key of the client in the state of a request that only administrators may make."""
 _BEARER = HTTPBearer(auto_error=False, scheme_name="token", description="of tokens.yaml")
+
+
+class EventStream:
+    """The newest event of each kind, for each mission. Any thread may call."""
+
+    def __init__(self, current: Callable[[], str] = str, beat_s: float = 5.0) -> None:
+        """``current``: name of the mission that the present request is about, if there are several; ``beat_s``: a
+        stream says something at least so often, so that a client notices a dead connection.
+        """
+        self._current, self.beat_s = current, beat_s
+        self._newest: dict[str, dict[str, tuple[int, int]]] = {}
+        self._counter = itertools.count()
+
+    def publish(self, kind: str, number: int, mission: str = "") -> None:
+        """Tell all who watch a mission."""
+        self._newest[mission] = {**self._newest.get(mission, {}), kind: (next(self._counter), number)}
+
+    def newest(self) -> dict[str, tuple[int, int]]:
+        """By kind, which of all events the newest one of the current mission is, and its number."""
+        return self._newest.get(self._current(), {})
 
 
 class ViewerState(Protocol):

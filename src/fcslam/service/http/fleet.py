@@ -1,0 +1,260 @@
+"""Routes of viewers about the fleet: robots, closures, joins, edits and learning."""
+
+import csv
+import json
+import math
+import shutil
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Final
+
+from fastapi import APIRouter, Depends, HTTPException, Query, Request
+from fastapi import Path as PathParameter
+from fastapi.responses import Response
+from pydantic import Field
+
+import fcslam
+from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
+from fcslam.cloud.sessions import session_name
+from fcslam.errors import InputError
+from fcslam.maps.palette import robot_colors
+from fcslam.records import Channel, ClosureStatus, Edit
+from fcslam.runs import ClosureRow, Run
+from fcslam.service.http.authentication import VIEWERS, Role
+from fcslam.service.http.responses import (
+    ClosureSummary,
+    EditSummary,
+    FleetSummary,
+    LearningRound,
+    MapJoin,
+    RobotSummary,
+    SessionSummary,
+    file_of,
+    refusals,
+    response_of,
+    unless_known,
+)
+from fcslam.service.http.robots import Name, refused_packets
+from fcslam.service.http.state import ViewerState
+from fcslam.service.keyscans import live_pose, live_scan, overlay_png
+from fcslam.service.viewed_mission import ViewedMission, run_of
+from fcslam.wire.limits import MAXIMUM_EPOCH
+
+ROUNDS_FILE: Final = "rounds.csv"
+"""In the output folder of `fcslam tools federate`."""
+_LOSS = "loss_"
+_MEASURES = ("repeatability", "mma_3px", "revisit_recall", "places_found")
+_CLOSURE = "/closures/{channel}/{robot_i}/{stamp_i}/{robot_j}/{stamp_j}"
+
+Point = Annotated[list[float], Field(min_length=2, max_length=2, description="x and y in metres")]
+Stamp = Annotated[float, PathParameter(allow_inf_nan=False, description="of a keyscan, seconds")]
+
+
+def fleet_router(state: ViewerState) -> APIRouter:
+    """Robots, closures, edits and learning."""
+    router = APIRouter(tags=["fleet"], dependencies=state.require(*VIEWERS), responses=refusals(401, 403, 503, 507))
+
+    @router.get("/fleet")
+    def get_fleet(request: Request) -> FleetSummary:
+        """Counts."""
+        mission = state.mission
+        run, counts, folder = run_of(mission), mission.packet_counts(), mission.run_folder
+        is_live = folder is not None and not state.read_only
+        return FleetSummary(
+            mission=mission.name,
+            version=fcslam.__version__,
+            read_only=state.read_only,
+            may_edit=not state.read_only and state.admits(request, Role.ADMIN),
+            map_age_s=max(time.time() - folder.stat().st_mtime, 0.0) if folder is not None and is_live else None,
+            free_bytes=shutil.disk_usage(folder).free if folder is not None and is_live else None,
+            packets=counts.arrived,
+            applied=counts.applied,
+            waiting=counts.waiting,
+            worker_ready=counts.worker_ready,
+            robots=list(run.trajectories),
+            maps=len({robot.map_index for robot in run.trajectories.values()}),
+            metrics={name: _finite(metric.value) for name, metric in run.metrics.items()},
+        )
+
+    @router.get("/robots")
+    def get_robots() -> list[SessionSummary]:
+        """All robots' sessions."""
+        robots = dict.fromkeys(session.robot for session in state.mission.sessions())
+        return [session for robot in robots for session in _sessions_of(state.mission, robot)]
+
+    @router.get("/robots/{robot}", responses=refusals(400, 404))
+    def get_robot(robot: Name) -> RobotSummary:
+        """One robot's sessions, and packets of it that were refused."""
+        sessions = _sessions_of(state.mission, robot)
+        if not sessions:
+            raise HTTPException(404, f"there is no robot '{robot}'")
+        return RobotSummary(robot=robot, sessions=sessions, refused=refused_packets(state.mission.store, robot))
+
+    @router.get("/closures", response_model=list[ClosureSummary], responses=refusals(400))
+    def get_closures(
+        request: Request, status: ClosureStatus | None = None, limit: Annotated[int, Query(ge=1, le=10_000)] = 1000
+    ) -> Response:
+        """The newest closures."""
+        return unless_known(request, _newest_closures(run_of(state.mission), status, limit), "application/json")
+
+    def closure_of(channel: Channel, robot_i: Name, stamp_i: Stamp, robot_j: Name, stamp_j: Stamp) -> ClosureRow:
+        for c in run_of(state.mission).closures:
+            if (channel, robot_i, stamp_i, robot_j, stamp_j) == (c.channel, c.robot_i, c.stamp_i, c.robot_j, c.stamp_j):
+                return c
+        raise HTTPException(404, "this closure does not exist at present")
+
+    @router.get(f"{_CLOSURE}.png", **file_of("image/png", refused=(400, 404)))
+    def get_closure_picture(closure: Annotated[ClosureRow, Depends(closure_of)]) -> Response:
+        """Walls around both ends of a closure, laid on each other as it measured them."""
+        try:
+            picture = overlay_png(state.mission.store, run_of(state.mission), closure)
+        except InputError as error:
+            raise HTTPException(404, str(error)) from error
+        return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=60"})
+
+    @router.get(_CLOSURE, responses=refusals(400, 404))
+    def get_closure(closure: Annotated[ClosureRow, Depends(closure_of)]) -> ClosureSummary:
+        """One closure as it is now."""
+        return _closure_summary(closure)
+
+    @router.get("/joins")
+    def get_joins() -> list[MapJoin]:
+        """On what evidence robots share a map, for every two with closures between them that agree."""
+        run = run_of(state.mission)
+        maps = {robot.robot: robot.map_index for robot in run.trajectories.values()}
+        measures = "seen_m", "contradicting_m", "likeness", "elsewhere"
+        return [
+            response_of(
+                MapJoin,
+                join,
+                robots=(join.robot_i, join.robot_j),
+                map=maps[join.robot_i],
+                explanation=str(join),
+                **{name: _finite(getattr(join, name)) for name in measures},
+            )
+            for join in run.joins
+            if maps.get(join.robot_i, -1) == maps.get(join.robot_j)
+        ]
+
+    @router.get("/robots/{robot}/scans/{epoch}", responses=refusals(400, 404))
+    def get_scan(robot: Name, epoch: Annotated[int, PathParameter(ge=0, le=MAXIMUM_EPOCH)]) -> list[Point]:
+        """Points of the newest scan of a session in the robot's base frame, metres; empty before the first scan."""
+        points: list[Point] = live_scan(state.mission.store, robot, epoch).round(3).tolist()
+        return points
+
+    @router.get("/edits")
+    def get_edits() -> list[EditSummary]:
+        """All edits, and what undid them."""
+        edits = state.mission.store.edits()
+        gone = undone(edits)
+        return [edit_summary(edit, gone.get(edit.number)) for edit in edits]
+
+    @router.get("/learning")
+    def get_learning() -> list[LearningRound]:
+        """The rounds of the federated training, oldest first; none if the service knows of no training."""
+        return [] if state.learning is None else read_rounds(state.learning)
+
+    return router
+
+
+def edit_summary(edit: Edit, undone_by: int | None = None) -> EditSummary:
+    """An edit as viewers see it."""
+    return response_of(EditSummary, edit, kind=kind_of(edit.content), content=asdict(edit.content), undone_by=undone_by)
+
+
+def _sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
+    store = mission.store
+    mapped = {name: known for name, known in run_of(mission).trajectories.items() if len(known.stamps)}
+    colors = robot_colors({session_name(*session[:2]) for session in mission.sessions()})
+    sessions, changes, heard_s = [], in_force(store.edits()), mission.last_heard_s(robot)
+    for session in mission.sessions(robot):
+        name = session_name(robot, session.epoch)
+        known, hello = mapped.get(name), store.newest_hello(robot, session.epoch)
+        stored = store.correction(robot, session.epoch)
+        correction = stored.correction if stored else None
+        pose = known.T_map_base[-1] if known else None
+        if known and heard_s is not None:  # nobody is heard in a finished run
+            pose = live_pose(store, robot, session.epoch, known)
+        sessions.append(
+            SessionSummary(
+                robot=robot,
+                session=name,
+                epoch=session.epoch,
+                packets=session.next,
+                map=known.map_index if known else None,
+                floor=known.floor if known else "",
+                path_length_m=known.path_length_m if known else 0.0,
+                keyscans=len(known.stamps) if known else 0,
+                color=f"#{colors[name]:06x}",
+                first_s=float(known.stamps[0]) if known else None,
+                last_s=float(known.stamps[-1]) if known else None,
+                T_map_base=pose.tolist() if pose is not None else None,
+                T_map_odom=correction.T_map_odom.tolist() if correction else None,
+                correction=correction.version if correction else -1,
+                quality=correction.quality if correction else 0.0,
+                removed=is_removed(name, changes),
+                detectors=dict(hello.detector_versions) if hello else {},
+                last_heard_s=heard_s,
+            )
+        )
+    return sessions
+
+
+@lru_cache(maxsize=8)  # many pages ask for the same
+def _newest_closures(run: Run, status: ClosureStatus | None, limit: int) -> bytes:
+    chosen = [closure for closure in run.closures if status in (None, closure.status)]
+    summaries = [_closure_summary(closure).model_dump(mode="json") for closure in chosen[-limit:]]
+    return json.dumps(summaries, allow_nan=False, separators=(",", ":")).encode()
+
+
+def _closure_summary(closure: ClosureRow) -> ClosureSummary:
+    reason = closure.reason
+    return response_of(
+        ClosureSummary,
+        closure,
+        T_i_j=closure.T_i_j.tolist(),
+        reason=reason.code,
+        value=reason.value,
+        limit=reason.limit,
+        setting=reason.setting,
+        explanation=str(reason),
+    )
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no NaN."""
+    return value if math.isfinite(value) else None
+
+
+def read_rounds(folder: Path) -> list[LearningRound]:
+    """The rounds so far, oldest first; none before the first one is done.
+
+    Raises:
+        InputError: the table is damaged.
+    """
+    path = folder / ROUNDS_FILE
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return [_round(row) for row in csv.DictReader(file)]
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
+        raise InputError(f"{path}: is not a table of rounds ({error})") from error
+
+
+def _round(row: Mapping[str, str]) -> LearningRound:
+    shown = {name: text for name, text in row.items() if text and (name.startswith(_LOSS) or name in _MEASURES)}
+    numbers = {name: number for name, text in shown.items() if math.isfinite(number := float(text))}
+    return LearningRound(
+        round=int(row["round"]),
+        version=row["version"],
+        released=row["released"] == "1",
+        robots=[robot for robot in row["robots"].split(" | ") if robot],
+        left_out=row["left_out"],
+        reason=row.get("reason") or "",
+        losses={name.removeprefix(_LOSS): number for name, number in numbers.items() if name.startswith(_LOSS)},
+        measures={name: number for name, number in numbers.items() if name in _MEASURES},
+    )
