@@ -31,7 +31,6 @@ BOMB_BYTES = 1 << 30
 
 OWN = {
     "compiled.py": "the cache of this user",
-    "ros/record.py": "the recording that this process writes",
     "wire/keys.py": "the robot's own token",
     "cli/serving.py": "written by the training that this service started",
     "features/network_check.py": "the memory of this process",
@@ -41,7 +40,6 @@ OWN = {
     "page/report.py": "files of the package",
     "page/routes.py": "files of the package",
     "service": "the folder of the service",
-    "sources/bags/mcap_records.py": "the recording that this process writes",
     "storage": "the folder of the service or of this user",
     "wire/prediction.py": "files of the package",
 }
@@ -294,13 +292,4 @@ def test_files_of_a_folder_are_named_once_and_are_its_own(tmp_path):
     data.rename(tmp_path / "elsewhere")
     data.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(SourceError, match="is a link"):
-        open_source(path).survey()
-
-
-def test_metadata_of_a_folder_does_not_expand(tmp_path):
-    path = tmp_path / "bag"
-    save(path, [mounted(), *drive(3)])
-    metadata = path / "metadata.yaml"
-    metadata.write_text(MERGES + metadata.read_text())
-    with pytest.raises(SourceError, match="aliases"):
         open_source(path).survey()

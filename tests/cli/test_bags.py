@@ -165,11 +165,11 @@ def test_a_band_of_heights_that_is_none(tmp_path, bag, capsys, band):
 
 
 def test_bad_bags_leave_nothing(tmp_path, capsys):
-    (tmp_path / "unindexed.bag").write_bytes(b"#ROSBAG V2.0\n")
+    (tmp_path / "empty.bag").write_bytes(b"#ROSBAG V2.0\n")
     bad = {
         save(tmp_path / "nothing.bag", [text(1.0)]): "no laser scans",
         save(tmp_path / "no_tf.mcap", drive(20)[1:]): "--sensors laser-pose",
-        tmp_path / "unindexed.bag": "rosbag reindex",
+        tmp_path / "empty.bag": "there are no topics",
     }
     for path, reason in bad.items():
         assert reason in refused(capsys, "map", path, "-o", tmp_path / "out")

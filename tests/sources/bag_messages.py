@@ -2,6 +2,7 @@
 
 import math
 import shutil
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -98,15 +99,17 @@ def drive(scans=40, start=100.0):
     return [*said, odom(start + 0.2 * scans, pose_at(0.2 * scans))]
 
 
-def save(path: Path, said: Iterable[Said], compression: str = "") -> Path:
+def save(path: Path, said: Iterable[Said], compression: str = "", chunk_bytes: int | None = None) -> Path:
     """Write messages in the order of their bag times; the path's suffix says which kind of bag."""
     messages = sorted(said, key=lambda message: message.bag_time)
     if path.suffix == ".bag":
         writer = rosbag1.Writer(path)
         if compression:
             writer.set_compression(rosbag1.Writer.CompressionFormat[compression.upper()])
+        if chunk_bytes is not None:
+            writer.chunk_threshold = chunk_bytes
         with writer:
-            _write(writer, messages, ROS1, ROS1.serialize_ros1)
+            _write(writer, messages, ROS1)
         return path
     sqlite = path.suffix == ".db3"
     plugin = rosbag2.StoragePlugin.SQLITE3 if sqlite else rosbag2.StoragePlugin.MCAP
@@ -115,7 +118,7 @@ def save(path: Path, said: Iterable[Said], compression: str = "") -> Path:
     if compression:
         writer.set_compression(rosbag2.CompressionMode[compression.upper()], rosbag2.CompressionFormat.ZSTD)
     with writer:
-        _write(writer, messages, ROS2, ROS2.serialize_cdr)
+        _write(writer, messages, ROS2, chunk_bytes)
     if not path.suffix:
         return path
     (folder / path.name).rename(path)
@@ -123,15 +126,30 @@ def save(path: Path, said: Iterable[Said], compression: str = "") -> Path:
     return path
 
 
-def _write(writer, messages, store, serialize):
+def mcap_places(content):
+    """Opcode of each record of an MCAP file, and where its content begins and ends."""
+    at = 8
+    while at < len(content) - 8:
+        opcode, size = struct.unpack_from("<BQ", content, at)
+        yield opcode, at + 9, (at := at + 9 + size)
+
+
+def _write(writer, messages, store, chunk_bytes=None):
     connections = {}
     for topic, kind, bag_time, fields in messages:
         if (topic, kind) not in connections:
             connections[topic, kind] = writer.add_connection(topic, kind, typestore=store)
-        payload = fields.get("payload")
-        if payload is None:
-            payload = serialize(_message(store, kind, fields), kind)
+        payload = payload_of(Said(topic, kind, bag_time, fields), store is ROS1)
         writer.write(connections[topic, kind], round(bag_time * 1e9), payload)
+        if chunk_bytes is not None and writer.storage.chunk.bio.tell() > chunk_bytes:
+            writer.storage.close_chunk()
+
+
+def payload_of(message, is_ros1):
+    """The bytes of a message."""
+    store, serialize = (ROS1, ROS1.serialize_ros1) if is_ros1 else (ROS2, ROS2.serialize_cdr)
+    payload = message.fields.get("payload")
+    return serialize(_message(store, message.kind, message.fields), message.kind) if payload is None else payload
 
 
 def _message(store, kind, fields):

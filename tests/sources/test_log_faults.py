@@ -1,4 +1,3 @@
-import errno
 import gzip
 import lzma
 import os
@@ -72,18 +71,8 @@ def test_a_pipe_is_refused_because_it_can_be_read_only_once(tmp_path):
     assert "is a pipe or device" in refusal(Path(os.devnull))
 
 
-@pytest.mark.parametrize("reason", ["name too long", "denied"])
-def test_what_the_system_does_not_show_is_refused(tmp_path, reason, monkeypatch):
-    path = tmp_path / ("a" * 400 + ".clf")
-    if reason == "denied":
-        path = tmp_path / "private"
-        path.mkdir()
-        monkeypatch.setattr(Path, "is_file", denied)
-    assert reason in refusal(path)
-
-
-def denied(path, **_):
-    raise PermissionError(errno.EACCES, "Permission denied", str(path))
+def test_a_name_that_is_too_long_is_refused(tmp_path):
+    assert "name too long" in refusal(tmp_path / ("a" * 400 + ".clf"))
 
 
 @pytest.mark.slow

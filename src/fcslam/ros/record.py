@@ -16,7 +16,6 @@ from fcslam.ros.live_plan import Notify
 from fcslam.ros.network import RosNetwork
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.codec import full_name, typestore
-from fcslam.sources.bags.mcap_records import end_mcap
 
 _POLL_S = 0.2
 
@@ -30,7 +29,8 @@ def record(
 ) -> Counter[str]:
     """Write all messages of the sensors, and /clock, until ``stop``; returns their number by topic.
 
-    The file moves to ``output`` at the end. If it cannot be written to the end, what the disk took is kept beside it.
+    The file moves to ``output`` at the end. If it cannot be written to the end, what the disk took is kept beside it,
+    but for the last megabyte.
 
     Raises:
         InputError: the file cannot be written; the message names the file that is kept.
@@ -51,7 +51,9 @@ def record(
                         counts[message.topic] += 1
                 recording.writer.close()
             except BaseException as error:
-                if recording.rescue(error):
+                with suppress(Exception):
+                    recording.writer.abort()
+                if counts and recording.file.exists():  # a bag that was cut off is read up to there
                     kept = f"what was recorded before is in {recording.file.replace(_part_of(output))}"
                     if not isinstance(error, OSError):
                         notify(kept)
@@ -86,22 +88,6 @@ class _Recording:
         self._latest_ns = 0
         self.writer = rosbag2.Writer(place, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
         self.file = place / f"{place.name}.mcap"
-
-    def rescue(self, error: BaseException) -> bool:
-        """End the file after an error, and return whether it holds messages.
-
-        After an error of the disk, the last megabyte is lost.
-        """
-        if not isinstance(error, OSError):
-            with suppress(Exception):
-                self.writer.close()
-                return bool(self._connections)
-        with suppress(Exception):
-            self.writer.abort()
-        try:
-            return end_mcap(self.file)
-        except OSError:
-            return self.file.exists()
 
     def write(self, message: ReceivedMessage, kind: str) -> None:
         """Write a message; the time of recording only ever grows."""

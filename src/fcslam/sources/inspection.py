@@ -9,9 +9,10 @@ from fcslam.errors import SourceError
 from fcslam.geometry.beams import is_same_laser
 from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odometry
 from fcslam.sources.bags.census import DecodedBag
-from fcslam.sources.bags.container import Topic
+from fcslam.sources.bags.codec import SCANS
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag
+from fcslam.sources.bags.transforms import Link
 from fcslam.sources.formats import format_of, open_source, robot_in
 from fcslam.sources.source import Source
 
@@ -160,21 +161,15 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
 
 def _bag_contents(bag: DecodedBag) -> BagContents:
     """What is in all messages; those that cannot be decoded count as the others."""
-    spans_ns: dict[Topic, tuple[int, int, int]] = {}
-    for message in bag.messages(bag.topics):
-        topic, now_ns = message.topic, message.bag_time_ns
-        count, first_ns, last_ns = spans_ns.get(topic, (0, now_ns, now_ns))
-        spans_ns[topic] = count + 1, min(first_ns, now_ns), max(last_ns, now_ns)
-    topics = (_topic_contents(topic, spans_ns.get(topic)) for topic in bag.topics)
-    edges = dict.fromkeys((parent, child) for _, parent, child in bag.census.links)
-    frames = {topic.name: tuple(seen) for topic, seen in bag.census.scan_frames.items()}
+    topics, edges, frames = [], dict[Link, None](), {}
+    for topic, its in bag.census.items():
+        first_ns, last_ns = its.span_ns
+        rate_hz = (its.count - 1) * 1e9 / (last_ns - first_ns) if last_ns > first_ns else None
+        topics.append(TopicContents(topic.name, topic.type, its.count, rate_hz))
+        edges |= dict.fromkeys(its.links)
+        if topic.type in SCANS:
+            frames[topic.name] = tuple(its.frames)
     return BagContents(tuple(topics), tuple(edges), frames)
-
-
-def _topic_contents(topic: Topic, span_ns: tuple[int, int, int] | None) -> TopicContents:
-    count, first_ns, last_ns = span_ns or (topic.message_count, 0, 0)
-    rate_hz = (count - 1) * 1e9 / (last_ns - first_ns) if last_ns > first_ns else None
-    return TopicContents(topic.name, topic.type, count, rate_hz)
 
 
 def _rate_hz(stamps: list[float]) -> float | None:

@@ -1,21 +1,44 @@
-"""The frames in a bag: of its scans, of its odometry and in tf, from one pass over it."""
+"""The messages of a bag, from one pass over its files: what they name, and where each lies.
 
+Laser scans, odometry and transforms are decoded in this pass and kept in a temporary file. Point clouds and images are
+too large for that; they are decoded whenever they are read.
+"""
+
+import os
+from array import array
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
-from heapq import merge
 from pathlib import Path
-from tempfile import gettempdir
+from tempfile import TemporaryFile, gettempdir
 from typing import Any, Final, NamedTuple
+from weakref import finalize
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
 from fcslam.records import Transform
-from fcslam.sources.bags.codec import LASER_SCANS, ODOMETRY, SCANS
-from fcslam.sources.bags.container import BagFile, RawMessage, Topic, is_transforms
+from fcslam.sources.bags.codec import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    FIX,
+    IMAGE,
+    LASER_SCANS,
+    ODOMETRY,
+    OLD_TRANSFORMS,
+    SCANS,
+    TRANSFORMS,
+    MessageCodec,
+)
+from fcslam.sources.bags.container import ZSTD, BagPart, Topic, check_order, open_parts
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage, header_of, odometry_of, scan_of, transforms_of
-from fcslam.sources.bags.tape import Content, Tape
-from fcslam.sources.bags.transforms import TransformTree, differ
+from fcslam.sources.bags.records import MessagePlace, StoredMessage
+from fcslam.sources.bags.tape import Content, packed_content, unpacked_content
+from fcslam.sources.bags.transforms import Link, TransformTree, differ
+from fcslam.untrusted import unpack
 
 UNSET_SHARE: Final = 0.5
 """Share of the messages that repeat the stamp of the one before if nobody sets it, or not its nanoseconds."""
@@ -26,9 +49,14 @@ FEWEST_REPEATS: Final = 20
 SAME_TIME_NS: Final = 100_000
 """Writers of bags put messages of one time in order by shorter steps."""
 
-Stamped = tuple[Topic, str, str]
-"""Messages of one driver: a topic of scans or odometry and two empty names, or one of tf with the parent and
-the child of a transform."""
+_LATEST_NS: Final = 2**63 - 1
+"""Of a damaged file, some times are larger."""
+_ROWS_AT_ONCE: Final = 256
+_LONGEST_TOPIC: Final = 255
+"""Characters in a topic's name, as in ROS 2."""
+_KEPT: Final = (*LASER_SCANS, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
+_COUNTED: Final = (*SCANS, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
+_READ: Final = (*_COUNTED, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, FIX)
 
 
 @dataclass(slots=True)
@@ -74,63 +102,65 @@ class Clock:
 
 
 @dataclass(slots=True)
-class Census:
-    """The frames that the messages of a bag name."""
+class TopicCensus:
+    """What the messages of a topic name, in the order of the files."""
 
-    scan_frames: dict[Topic, Counter[str]] = field(default_factory=dict)
-    """Frames of the scans on each topic, with their numbers of messages."""
-    base_frames: dict[Topic, Counter[str]] = field(default_factory=dict)
-    """Child frames on each topic of odometry."""
-    links: dict[tuple[Topic, str, str], list[Transform]] = field(default_factory=dict)
-    """Transforms on a topic of tf from a parent to a child: the first, and the first that differs from it."""
-    broken: dict[Topic, Broken] = field(default_factory=dict)
-    clocks: dict[Stamped, Clock] = field(default_factory=dict)
+    number: int
+    """Counts the topics from 0."""
+    count: int = 0
+    span_ns: tuple[int, int] = (0, 0)
+    """First and last time of recording."""
+    frames: Counter[str] = field(default_factory=Counter)
+    """Frames of scans, or child frames of odometry, with their numbers of messages."""
+    links: dict[Link, list[Transform]] = field(default_factory=dict)
+    """Transforms of tf from a parent to a child: the first, and the first that differs from it."""
+    clocks: dict[Link, Clock] = field(default_factory=dict)
+    """Stamps of each transform of tf; of a topic of scans or odometry, by two empty names."""
+    broken: Broken | None = None
 
-    def tree(self, topics: Iterable[Topic]) -> TransformTree:
-        """The frames and transforms on these topics."""
-        tree, chosen = TransformTree(), set(topics)
-        for (topic, parent, child), transforms in self.links.items():
-            for transform in transforms if topic in chosen else ():
-                tree.add(parent, child, transform)
-        return tree
+    def add(self, time_ns: int) -> None:
+        """Count a message."""
+        first_ns, last_ns = self.span_ns if self.count else (time_ns, time_ns)
+        self.count, self.span_ns = self.count + 1, (min(first_ns, time_ns), max(last_ns, time_ns))
 
-    def has_recorded_clock(self, stamped: Stamped) -> bool:
-        """Whether the times of recording of these messages count, as nobody sets their stamps."""
-        clock = self.clocks.get(stamped)
-        return clock is not None and clock.is_unset and clock.is_recorded
-
-    def count(self, message: RawMessage, content: Any) -> Content | None:
-        """Count an object of rosbags and convert it; None for a point cloud. Raises ValueError if it is invalid."""
-        topic, now_ns = message.topic, message.bag_time_ns
-        clock = self.clocks.setdefault((topic, "", ""), Clock())
-        if topic.type in SCANS:
+    def converted(self, message: StoredMessage, content: Any) -> Content | None:
+        """Convert an object of rosbags; None for a point cloud. Raises ValueError if it is invalid."""
+        now_ns = message.time_ns
+        if message.kind in SCANS:
             stamp, frame = header_of(content.header, now_ns)
-            self.scan_frames.setdefault(topic, Counter())[frame] += 1
-            clock.add(stamp, now_ns, (frame, getattr(content, "angle_min", 0.0)), message.payload[_STAMP_END:])
-            return scan_of(content, now_ns) if topic.type in LASER_SCANS else None
-        if topic.type == ODOMETRY:
+            self.frames[frame] += 1
+            sensor = frame, getattr(content, "angle_min", 0.0)
+            self._clock(("", "")).add(stamp, now_ns, sensor, message.payload[_STAMP_END:])
+            return scan_of(content, now_ns) if message.kind in LASER_SCANS else None
+        if message.kind == ODOMETRY:
             reading = odometry_of(content, now_ns)
-            self.base_frames.setdefault(topic, Counter())[reading.base_frame] += 1
-            clock.add(reading.stamp, now_ns, reading.base_frame, reading.T_odom_base)
+            self.frames[reading.base_frame] += 1
+            self._clock(("", "")).add(reading.stamp, now_ns, reading.base_frame, reading.T_odom_base)
             return reading
         transforms = list(transforms_of(content, now_ns))
         for stamp, parent, child, transform in transforms:
-            link = topic, parent, child
-            self.clocks.setdefault(link, Clock()).add(stamp, now_ns, "", transform)
-            seen = self.links.setdefault(link, [transform])
+            self._clock((parent, child)).add(stamp, now_ns, "", transform)
+            seen = self.links.setdefault((parent, child), [transform])
             if len(seen) == 1 and differ(seen[0], transform):
                 seen.append(transform)
         return transforms
 
-    def stamped(self, topic: Topic, time_ns: int, content: Content) -> Content:
+    def _clock(self, link: Link) -> Clock:
+        return self.clocks.setdefault(link, Clock())
+
+    def has_recorded_clock(self, link: Link = ("", "")) -> bool:
+        """Whether the times of recording count, as nobody sets the stamps."""
+        clock = self.clocks.get(link)
+        return clock is not None and clock.is_unset and clock.is_recorded
+
+    def stamped(self, time_ns: int, content: Content) -> Content:
         """A message with its time of recording as its stamp, if nobody sets that."""
+        stamp = time_ns / 10**9
         if isinstance(content, ScanMessage | OdometryReading):
-            return content._replace(stamp=time_ns / 10**9) if self.has_recorded_clock((topic, "", "")) else content
+            return content._replace(stamp=stamp) if self.has_recorded_clock() else content
         if isinstance(content, list):
             return [
-                each._replace(stamp=time_ns / 10**9)
-                if self.has_recorded_clock((topic, each.parent, each.child))
-                else each
+                each._replace(stamp=stamp) if self.has_recorded_clock((each.parent, each.child)) else each
                 for each in content
             ]
         return content
@@ -155,72 +185,156 @@ class BagMessage(NamedTuple):
         return self.decoded
 
 
-@dataclass(frozen=True)
-class DecodedBag(BagFile):
-    """A bag whose laser scans, odometry and transforms are decoded and counted once.
+class _Index(NamedTuple):
+    parts: tuple[BagPart, ...]
+    census: dict[Topic, TopicCensus]
+    """By topic, sorted by name."""
+    rows: NDArray[np.int64]
+    """Time, number of the topic and of the part, and place of each message that can be read, in the order of time."""
+    tape: int
+    """File descriptor of the decoded messages."""
 
-    Point clouds and images are too large to be kept; they are decoded whenever they are read.
+
+@dataclass(frozen=True)
+class DecodedBag:
+    """A bag: one file, or several that are parts of one recording, merged by the times of recording.
+
+    Any thread, and any copy of the process, may read it.
     """
+
+    path: Path
 
     def __reduce__(self) -> "tuple[type[DecodedBag], tuple[Path]]":
         return DecodedBag, (self.path,)  # a copy in another process decodes the bag again
 
     @property
-    def census(self) -> Census:
-        """The frames of all scans, odometry and transforms; those of messages that are invalid are left out."""
-        return self._census_and_tape[0]
+    def topics(self) -> tuple[Topic, ...]:
+        """All topics, sorted by name; a topic with two types is listed twice."""
+        return tuple(self._index.census)
+
+    @property
+    def census(self) -> dict[Topic, TopicCensus]:
+        """What the messages of each topic name; those that are invalid are left out."""
+        return self._index.census
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Which files were not read to their end, as sentences."""
+        return tuple(part.note for part in self._index.parts if part.note)
+
+    def tree(self, topics: Iterable[Topic]) -> TransformTree:
+        """The frames and transforms on these topics of tf."""
+        tree = TransformTree()
+        for topic in topics:
+            for (parent, child), transforms in self.census[topic].links.items():
+                for transform in transforms:
+                    tree.add(parent, child, transform)
+        return tree
 
     def read(self, topics: Collection[Topic]) -> Iterator[BagMessage]:
-        """The messages of ``topics`` in the order of recording."""
-        kept = [topic for topic in topics if _is_kept(topic)]
-        others = [topic for topic in topics if not _is_kept(topic)]
-        streams = [*[self._kept_messages(kept)] * bool(kept), *[self._other_messages(others)] * bool(others)]
-        return merge(*streams, key=lambda message: message.bag_time_ns)
+        """The messages of ``topics`` in the order of recording.
 
-    def _kept_messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
-        census, tape = self._census_and_tape
-        topic_of = {self.topics.index(topic): topic for topic in topics}
-        counts = Counter[int]()
-        for at, time_ns, content in tape.read(topic_of):
-            counts[at] += 1
-            yield BagMessage(topic_of[at], counts[at], time_ns, census.stamped(topic_of[at], time_ns, content))
+        Raises:
+            SourceError: the bag cannot be read again.
+        """
+        parts, census, rows, tape = self._index
+        by_number = {census[topic].number: topic for topic in topics}
+        counts: Counter[Topic] = Counter()
+        with ExitStack() as opened:
+            payloads: dict[int, Callable[[MessagePlace], bytes]] = {}
+            for begin in range(0, len(rows), _ROWS_AT_ONCE):
+                block = rows[begin : begin + _ROWS_AT_ONCE]
+                for time_ns, number, at, *place in block[np.isin(block[:, 1], list(by_number))].tolist():
+                    topic = by_number[number]
+                    counts[topic] += 1
+                    decoded: Any
+                    if topic.type in _KEPT:
+                        _, offset, size = place
+                        decoded = census[topic].stamped(time_ns, unpacked_content(os.pread(tape, size, offset)))
+                    else:
+                        with parts[at].translated():
+                            if at not in payloads:
+                                payloads[at] = opened.enter_context(parts[at].file.reading())
+                            payload = payloads[at](MessagePlace(*place))
+                        decoded = self._decoded(topic, payload, parts[at].file.ros1)
+                    yield BagMessage(topic, counts[topic], time_ns, decoded)
 
-    def _other_messages(self, topics: Sequence[Topic]) -> Iterator[BagMessage]:
-        for message in self.messages(topics):
-            content: Any
-            try:
-                content = self.decode(message)
-                if self.census.has_recorded_clock((message.topic, "", "")):
-                    content.header.stamp.sec = content.header.stamp.nanosec = 0
-            except ValueError as error:
-                content = error
-            yield BagMessage(*message[:3], content)
+    def _decoded(self, topic: Topic, payload: bytes, ros1: bool) -> Any:
+        try:
+            content = _decode(payload, topic.type, ros1)
+            if self.census[topic].has_recorded_clock():
+                content.header.stamp.sec = content.header.stamp.nanosec = 0
+        except ValueError as error:
+            return error
+        return content
 
     @cached_property
-    def _census_and_tape(self) -> tuple[Census, Tape]:
-        census = Census()
-        kinds = [topic for topic in self.topics if topic.type in (*SCANS, ODOMETRY) or is_transforms(topic)]
-        kinds.sort(key=lambda topic: topic.type in SCANS)  # at equal times, odometry comes first
-        numbers = {topic: at for at, topic in enumerate(self.topics)}
+    def _index(self) -> _Index:
+        parts, rows = open_parts(self.path), array("q")
+        found: dict[tuple[str, str], TopicCensus] = {}
         try:
-            tape = Tape()
-            for message in self.messages(kinds):
-                content: Content | None
-                try:
-                    content = census.count(message, self.decode(message))
-                except ValueError as error:
-                    content = error
-                    census.broken.setdefault(message.topic, Broken(message.number, str(error))).count += 1
-                if content is not None and _is_kept(message.topic):
-                    tape.add(numbers[message.topic], message.bag_time_ns, content)
-            tape.finish()
+            tape = TemporaryFile(prefix="fcslam-")  # noqa: SIM115  it lives as long as the bag
+            finalize(self, tape.close)
+            written = 0
+            for at, part in enumerate(parts):
+                count = 0
+                for message in _messages(part):
+                    count += 1
+                    named = message.topic, message.kind
+                    topic = found.get(named) or found.setdefault(named, TopicCensus(len(found)))
+                    time_ns, place = min(message.time_ns, _LATEST_NS), message.place
+                    topic.add(time_ns)
+                    if message.kind not in _READ:
+                        continue
+                    if message.kind in _COUNTED:
+                        content = _counted(topic, message, part.file.ros1)
+                        if content is not None and message.kind in _KEPT:
+                            size = tape.write(packed_content(content))
+                            place, written = MessagePlace(-1, written, size), written + size
+                    rows.extend((time_ns, topic.number, at, *place))
+                for named in part.file.topics.values():
+                    found.setdefault(named, TopicCensus(len(found)))
+                if part.file.damage and not count:
+                    raise part.refusal(f"it is cut off or damaged at {part.file.damage}")
+            tape.flush()
         except OSError as error:
             raise SourceError(
                 f"{gettempdir()}: decoded messages of {self.path} cannot be kept there ({error}); free some space, or "
                 "name another folder by TMPDIR"
             ) from error
-        return census, tape
+        table = np.frombuffer(rows, np.int64).reshape(-1, 6)
+        census = {Topic(*named, topic.count): topic for named, topic in sorted(found.items())}
+        by_number = sorted(census, key=lambda topic: census[topic].number)
+        # At equal times odometry and tf come first, then laser scans.
+        ranks = [(topic.type in SCANS) + 2 * (topic.type not in _KEPT) for topic in by_number]
+        table = table[np.lexsort((np.array(ranks, np.int64)[table[:, 1]], table[:, 0]))]
+        for read in census if len(parts) > 1 else ():
+            own = table[table[:, 1] == census[read].number] if read.type in SCANS else table[:0]
+            check_order(read.name, ((parts[at].path, time_ns) for time_ns, _, at, *_ in own.tolist()))
+        return _Index(parts, census, table, tape.fileno())
 
 
-def _is_kept(topic: Topic) -> bool:
-    return topic.type in (*LASER_SCANS, ODOMETRY) or is_transforms(topic)
+def _messages(part: BagPart) -> Iterator[StoredMessage]:
+    with part.translated():
+        for message in part.file.messages():
+            if len(message.topic) > _LONGEST_TOPIC:
+                raise SourceError(
+                    f"{part.path}: a topic's name has {len(message.topic)} characters; copy the bag again"
+                )
+            yield message
+
+
+def _counted(topic: TopicCensus, message: StoredMessage, ros1: bool) -> Content | None:
+    try:
+        return topic.converted(message, _decode(message.payload, message.kind, ros1))
+    except ValueError as error:
+        topic.broken = topic.broken or Broken(topic.count, str(error))
+        topic.broken.count += 1
+        return error
+
+
+def _decode(payload: bytes, kind: str, ros1: bool) -> Any:
+    """Decode a message to an object of rosbags; raises ValueError if the bytes are not a message of its type."""
+    if not ros1 and payload.startswith(ZSTD):
+        payload = unpack(payload, "zstd")
+    return MessageCodec(ros1).decode(payload, kind)

@@ -158,7 +158,7 @@ class _Planner:
         self._topics = choose_topics(
             _known_topics(robot), options, partial(_view_rad, robot), partial(_has_images, robot)
         )
-        self._tree = robot.bag.census.tree(robot.transforms)
+        self._tree = robot.bag.tree(robot.transforms)
         self._scans = BagScans(robot, self._topics.scans, options, self._tree, self._base_frame_of)
         self._notes: list[str] = []
         """Why an odometry is not used, or not as it is."""
@@ -173,11 +173,11 @@ class _Planner:
         )
         odometry = self._odometry(lasers[0].first.frame)
         ahead_s = 0.0 if odometry is None else self._clock_ahead_s(odometry)
-        read = {(topic, "", ""): topic.name for topic in topics.scans}
+        read = [(topic.name, topic, ("", "")) for topic in topics.scans]
         if odometry is not None:
-            read |= {(topic, *(odometry.edge or ("", ""))): odometry.name for topic in odometry.topics}
-        counted = self._bag.census.clocks
-        clocks = {name: counted[stamped] for stamped, name in read.items() if stamped in counted}
+            read += [(odometry.name, topic, odometry.edge or ("", "")) for topic in odometry.topics]
+        counted = {topic: its.clocks for topic, its in self._bag.census.items()}
+        clocks = {name: counted[topic][link] for name, topic, link in read if link in counted[topic]}
         calibration = calibration_in(self._robot, topics.camera_info)
         notes = tuple(self._notes)
         return BagPlan(topics, self._tree, self._scans, lasers, odometry, ahead_s, clocks, calibration, notes)
@@ -249,7 +249,7 @@ class _Planner:
 
     def _base_frame(self, topic: Topic) -> str | None:
         """The frame of the base on a topic of odometry that has several."""
-        frames = [frame for frame in usual(self._bag.census.base_frames.get(topic, {})) if frame]
+        frames = [frame for frame in usual(self._bag.census[topic].frames) if frame]
         chosen = self._options.base_frame or self._robot.base_frames.get(topic.name)
         if len(frames) < 2:
             return None
@@ -264,7 +264,7 @@ class _Planner:
         """The base of the robot with ``frame``, before its lasers are known."""
         bases = [self._options.base_frame]
         for topic in self._measured:
-            bases += [self._base_frame(topic), *self._bag.census.base_frames.get(topic, {})]
+            bases += [self._base_frame(topic), *self._bag.census[topic].frames]
         link = self._tree.odometry_link(frame, self._options.odom_frame)
         usual_ones = [each for each in USUAL_BASES if each in self._tree]
         return next(filter(None, (*bases, *(link or ())[1:], *usual_ones)), USUAL_BASES[-1])

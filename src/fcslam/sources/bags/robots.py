@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
-from fcslam.sources.bags.census import Census, DecodedBag
+from fcslam.sources.bags.census import DecodedBag
 from fcslam.sources.bags.codec import COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCANS
 from fcslam.sources.bags.container import Topic, is_transforms
 from fcslam.sources.bags.options import BagOptions
@@ -72,7 +72,7 @@ def robots_of(bag: DecodedBag, options: BagOptions) -> tuple[BagRobot, ...]:
         SourceError: the bag cannot be read, or its frames do not say which robot the scans of a topic are of.
     """
     heard = tuple(topic for topic in bag.topics if topic.message_count)
-    members, spaces = _members(heard, bag.census)
+    members, spaces = _members(heard, bag)
     labels = {(_prefix(member.frame), member.space) for member in members}
     robots = [member for member in members if member.moves] or (members if len(labels) == len(members) else [])
     if len(robots) < 2 and not (robots and any(_is_apart(member, robots[0]) for member in members)):
@@ -87,7 +87,7 @@ def robots_of(bag: DecodedBag, options: BagOptions) -> tuple[BagRobot, ...]:
             {
                 topic.name: tuple(frames)
                 for topic, frames in robot.scan_frames.items()
-                if len(bag.census.scan_frames[topic]) > 1
+                if len(bag.census[topic].frames) > 1
             },
             {topic.name: frame for topic, frame in robot.base_frames.items() if frame},
             notes,
@@ -141,8 +141,9 @@ def usual(counts: Mapping[str, int]) -> tuple[str, ...]:
     return tuple(name for name, count in counts.items() if count > TOLERATED_SHARE * sum(counts.values()))
 
 
-def _members(heard: Sequence[Topic], census: Census) -> tuple[list[_Member], set[str]]:
+def _members(heard: Sequence[Topic], bag: DecodedBag) -> tuple[list[_Member], set[str]]:
     """The scans that belong together, with their odometry, and the namespaces of robots."""
+    census = bag.census
     scans = [topic for topic in heard if topic.type in SCANS]
     odometry = [topic for topic in heard if topic.type == ODOMETRY and not is_truth(topic.name)]
     space_of = _spaces(scans, [*odometry, *filter(is_transforms, heard)])
@@ -153,9 +154,9 @@ def _members(heard: Sequence[Topic], census: Census) -> tuple[list[_Member], set
         space = space_of[topic]
         in_space = [each for each in heard if _innermost(each, spaces) == space]
         transforms = _transforms_around(topic, heard, in_space)
-        tree = trees.get(transforms) or trees.setdefault(transforms, census.tree(transforms))
-        for frame in usual(census.scan_frames.get(topic, {})):
-            of_frame = {space_of[each] for each in scans if frame in census.scan_frames.get(each, {})}
+        tree = trees.get(transforms) or trees.setdefault(transforms, bag.tree(transforms))
+        for frame in usual(census[topic].frames):
+            of_frame = {space_of[each] for each in scans if frame in census[each].frames}
             is_known = frame in tree and len(of_frame) == 1
             robot = tree.robot(frame) if frame in tree else _prefix(frame)
             member = members.setdefault(
@@ -165,7 +166,7 @@ def _members(heard: Sequence[Topic], census: Census) -> tuple[list[_Member], set
     found = list(members.values())
     for topic in odometry:
         inside = [member for member in found if member.space == _innermost(topic, spaces)] or found
-        for base in census.base_frames.get(topic, {}):
+        for base in census[topic].frames:
             for member in inside if len(inside) == 1 else [each for each in inside if each.holds(base)][:1]:
                 member.base_frames.setdefault(topic, base)
     return found, spaces
@@ -189,7 +190,7 @@ def _only_robot(bag: DecodedBag, members: Sequence[_Member], options: BagOptions
     heard = [topic for topic in bag.topics if topic.message_count]
     sensors = [topic for topic in heard if topic.type in (*SCANS, COMPRESSED_IMAGE, IMAGE)]
     transforms = {each for topic in sensors for each in _transforms_around(topic, heard, heard)}
-    scan_frames = {topic.name: usual(frames) for topic, frames in bag.census.scan_frames.items()}
+    scan_frames = {topic.name: usual(its.frames) for topic, its in bag.census.items() if topic.type in SCANS}
     scan_frames = {name: frames for name, frames in scan_frames.items() if len(frames) > 1}
     if not members:
         return BagRobot(bag, "/", bag.topics, tuple(sorted(transforms)), scan_frames, {})
@@ -197,7 +198,10 @@ def _only_robot(bag: DecodedBag, members: Sequence[_Member], options: BagOptions
     around = _namespaces(next(iter(member.scan_frames)))
     fitting: list[Topic] = []
     apart: list[Topic] = []
-    for topic, frames in bag.census.base_frames.items():
+    for topic, its in bag.census.items():
+        frames = its.frames if topic.type == ODOMETRY else {}
+        if not frames:
+            continue
         own = [frame for frame in usual(frames) if frame and member.holds(frame)]
         if len(own) == 1:
             base_frames[topic.name] = own[0]

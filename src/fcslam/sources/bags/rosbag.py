@@ -190,8 +190,9 @@ class RosBag:
     def _count_broken_transforms(self, audit: Audit, errors: dict[str, str]) -> None:
         """Count the transforms that no pass over the scans reads."""
         read = () if self.plan.odometry is None else self.plan.odometry.topics
-        for topic, broken in self.bag.census.broken.items():
-            if topic in self.plan.topics.transforms and topic not in read:
+        for topic in self.plan.topics.transforms:
+            broken = self.bag.census[topic].broken
+            if broken is not None and topic not in read:
                 errors.setdefault(topic.name, f"message {broken.first} of it: {broken.error}")
                 audit.add(Fault.BROKEN_MESSAGE, broken.first, broken.count)
 
