@@ -81,7 +81,7 @@ TRACKING = """
 import gc, json, sys
 from numba.core.dispatcher import Dispatcher
 from fcslam.records import Channel
-from fcslam.robot.backend_runner import WorkerBackend
+from fcslam.robot.backend_runner import in_worker
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.warmup import warm_up_tracking
 from tests.robot.kidnapping import kidnapping
@@ -95,7 +95,7 @@ def compiled():
     }
 
 config, executor = RobotConfig(channels=(Channel.LIDAR,)), Held()
-robot = RobotFrontend("r", config, WorkerBackend("r", config, executor))
+robot = RobotFrontend("r", config, in_worker("r", config, executor))
 executor.holds = True  # only the front end works
 scans, _ = kidnapping()
 cold = compiled()

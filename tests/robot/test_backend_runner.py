@@ -7,7 +7,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future
 import pytest
 
 from fcslam.records import Channel, Constraint, ConstraintKind, Keyscan, Place
-from fcslam.robot.backend_runner import BlockExecutor, WorkerBackend, copied_worker
+from fcslam.robot.backend_runner import copied_worker, in_worker
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import encode
@@ -61,7 +61,7 @@ def contents(packets):
 def test_poses_are_known_while_the_back_end_is_busy(scans):
     inline, expected = driven(scans)
     executor = Held()
-    robot = RobotFrontend("r", CONFIG, WorkerBackend("r", CONFIG, executor))
+    robot = RobotFrontend("r", CONFIG, in_worker("r", CONFIG, executor))
     executor.holds = True
     for number, scan in enumerate(scans, start=1):
         assert robot.process(scan) == []
@@ -77,7 +77,7 @@ def test_poses_are_known_while_the_back_end_is_busy(scans):
 def test_sessions_of_a_lost_robot_come_in_order_when_the_back_end_is_late():
     scans, _ = kidnapping()
     executor = Held()
-    backend = WorkerBackend("r", CONFIG, executor)
+    backend = in_worker("r", CONFIG, executor)
     robot, packets = RobotFrontend("r", CONFIG, backend), []
     for number, scan in enumerate(scans):
         executor.holds = number % 40 != 0
@@ -89,7 +89,7 @@ def test_sessions_of_a_lost_robot_come_in_order_when_the_back_end_is_late():
 
 def test_a_back_end_that_breaks_costs_closures_and_places_but_no_keyscan(scans):
     expected = driven(scans)[1]
-    robot, packets = driven(scans, WorkerBackend("r", CONFIG, Held(breaks_after=10)))
+    robot, packets = driven(scans, in_worker("r", CONFIG, Held(breaks_after=10)))
     assert robot.packets.failure == "BrokenExecutor: it was killed"
     assert contents(packets[:10]) == contents(expected[:10])
     kept = [p.body for p in expected if not isinstance(p.body, Place) and not is_closure(p.body)]
@@ -98,7 +98,7 @@ def test_a_back_end_that_breaks_costs_closures_and_places_but_no_keyscan(scans):
 
 
 def test_a_back_end_that_breaks_at_once_leaves_a_map(scans):
-    robot, packets = driven(scans, WorkerBackend("r", CONFIG, Held(breaks_after=1)))
+    robot, packets = driven(scans, in_worker("r", CONFIG, Held(breaks_after=1)))
     assert packets[0].body == Hello("r", 0, (scans[0].laser,), {})
     keyscans = [packet.body for packet in packets if isinstance(packet.body, Keyscan)]
     assert len(keyscans) > max(pose.keyscan for pose in robot.scan_poses)
@@ -116,7 +116,7 @@ def test_an_input_that_a_breaking_executor_loses_is_not_waited_for(scans):
             raise BrokenExecutor("it was killed")
 
     expected = driven(scans)[1]
-    _, packets = driven(scans, WorkerBackend("r", CONFIG, Losing(breaks_after=3)))
+    _, packets = driven(scans, in_worker("r", CONFIG, Losing(breaks_after=3)))
     assert keyscans(packets) == keyscans(expected)
 
 
@@ -133,11 +133,10 @@ def contents_of(bodies):
     return [(type(body), getattr(body, "id", None), getattr(body, "j", None)) for body in bodies]
 
 
-@pytest.mark.parametrize("block", [1, 8])
-def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothing(scans, block):
+def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothing(scans):
     expected = driven(scans)[1]
     with copied_worker() as executor:
-        backend = WorkerBackend("r", CONFIG, executor if block == 1 else BlockExecutor(executor, block))
+        backend = in_worker("r", CONFIG, executor)
         assert contents(driven(scans, backend)[1]) == contents(expected)
         worker = executor.submit(os.getpid).result()
         for stop in (signal.SIGINT, signal.SIGTERM):  # meant for the robot, which ends the worker itself
@@ -147,47 +146,3 @@ def test_a_process_beside_the_robot_gives_the_same_bytes_and_its_end_stops_nothi
         robot, packets = driven(scans, backend)
         assert "BrokenProcessPool" in robot.packets.failure
         assert keyscans(packets) == keyscans(expected)
-
-
-def test_tasks_start_together_when_their_block_is_full_or_a_result_is_asked_for():
-    inner = Held()
-    inner.holds = True
-    executor = BlockExecutor(inner, 3)
-    squares = [executor.submit(pow, number, 2) for number in range(4)]
-    assert len(inner._tasks) == 1
-    inner.work()
-    inner.holds = False
-    assert [square.done() for square in squares] == [True, True, True, False]
-    assert [square.result() for square in squares] == [0, 1, 4, 9]
-
-
-def test_an_error_of_a_task_is_one_of_its_block_alone():
-    class Failing(Held):
-        def submit(self, function, /, *arguments):
-            future = Future()
-            try:
-                future.set_result(function(*arguments))
-            except ValueError as error:
-                future.set_exception(error)
-            return future
-
-    executor = BlockExecutor(Failing(), 2)
-    words = [executor.submit(int, word) for word in ("1", "one", "2", "3")]
-    assert [task.exception() is not None for task in words] == [True, True, False, False]
-
-
-def test_a_block_that_a_breaking_executor_loses_is_not_waited_for():
-    class Losing(Executor):
-        tasks = 0
-
-        def submit(self, *_):
-            self.tasks += 1
-            if self.tasks == 1:
-                return Future()
-            raise BrokenExecutor("it was killed")
-
-    executor = BlockExecutor(Losing(), 2)
-    tasks = [executor.submit(os.getpid) for _ in range(3)]
-    for task in reversed(tasks):
-        with pytest.raises(BrokenExecutor, match="it was killed"):
-            task.result(timeout=1.0)

@@ -163,7 +163,7 @@ class Keyscans:
 
 def test_quality_falls_with_the_first_keyscan_that_shows_other_walls(fleet, building):
     robot, kept, config = fleet.robots[2], Keyscans(), MissionConfig().robot
-    frontend = RobotFrontend("robot", config, kept)
+    frontend = RobotFrontend("robot", config, kept.submit)
     for scan in robot.scans():
         frontend.process(scan)
     start = small_fleet.truth_at(robot, [robot.stamps[0]])[0]

@@ -18,7 +18,7 @@ from fcslam.mission.driving import legs
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import FloatArray
 from fcslam.robot.backend import BackendInput, RobotBackend, SessionEnd
-from fcslam.robot.backend_runner import InlineBackend
+from fcslam.robot.backend_runner import inline
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.image_buffer import KeyframeImage
 from fcslam.runs import Run
@@ -51,26 +51,25 @@ def map_drives(sources: Sequence[Source], config: MissionConfig, detector: Featu
         detector: describes the keyframes.
     """
     runners = {source.name: _Keeping(RobotBackend(source.name, config.robot)) for source in sources}
-    fronts = {name: RobotFrontend(name, config.robot, runner) for name, runner in runners.items()}
+    fronts = {name: RobotFrontend(name, config.robot, runner.submit) for name, runner in runners.items()}
     run = run_mission(
         sources, config, drive=lambda given, _: nullcontext([legs(source, fronts[source.name]) for source in given])
     )
     return {name: _drive(fronts[name], runner.kept, run, detector) for name, runner in runners.items()}
 
 
-class _Keeping(InlineBackend):
+class _Keeping:
     """A back end whose keyframes are kept beyond the end of its first session."""
 
     def __init__(self, backend: RobotBackend) -> None:
-        super().__init__(backend)
-        self._backend = backend
+        self._backend, self._submit = backend, inline(backend)
         self.kept: tuple[KeyframeImage, ...] | None = None
 
     def submit(self, input: BackendInput) -> "Future[list[Body]]":
         """As the back end does."""
         if isinstance(input, SessionEnd) and self.kept is None:
             self.kept = self._backend.keyframes
-        return super().submit(input)
+        return self._submit(input)
 
 
 def _drive(

@@ -50,11 +50,7 @@ class ClaimLimits(Settings):
 
 
 def check_constraint(constraint: Constraint, largest_m: float) -> None:
-    """Check a constraint, whose length is at most ``largest_m``.
-
-    Raises:
-        PacketError: it is longer, or more precise than a robot can measure.
-    """
+    """Check a constraint, whose length is at most ``largest_m``."""
     name = f"{constraint.robot}: constraint {constraint.i} to {constraint.j}"
     length_m = math.hypot(constraint.T_i_j[0], constraint.T_i_j[1])
     if not length_m <= largest_m:
@@ -94,11 +90,7 @@ def with_least_noise(constraint: Constraint) -> Constraint:
 
 
 def check_distance(T_odom_base: FloatArray, robot: str, limits: ClaimLimits) -> None:
-    """Check the pose (3,) of a keyscan by the robot's motions alone.
-
-    Raises:
-        PacketError: it is too far from the start.
-    """
+    """Check the pose (3,) of a keyscan by the robot's motions alone."""
     distance_m = math.hypot(T_odom_base[0], T_odom_base[1])
     if not distance_m <= limits.distance_m:
         raise PacketError(
@@ -107,11 +99,7 @@ def check_distance(T_odom_base: FloatArray, robot: str, limits: ClaimLimits) -> 
 
 
 def check_sighting(sighting: TagSighting) -> None:
-    """Check a sighting of a tag.
-
-    Raises:
-        PacketError: the tag is farther than a camera reads one.
-    """
+    """Check a sighting of a tag."""
     distance_m = math.hypot(sighting.T_base_tag[0], sighting.T_base_tag[1])
     if not distance_m <= FARTHEST_TAG_M:
         name = f"{sighting.id.robot}: tag {sighting.tag}"
@@ -119,11 +107,7 @@ def check_sighting(sighting: TagSighting) -> None:
 
 
 def check_submap(place: Place, poses: FloatArray) -> None:
-    """Check the submap of a place, whose keyscans have these poses (N, 3) by the robot's motions alone.
-
-    Raises:
-        PacketError: it has too many keyscans, or one is too far from the anchor.
-    """
+    """Check the submap of a place, whose keyscans have these poses (N, 3) by the robot's motions alone."""
     name = f"{place.id.robot}: {place.channel} place {place.id.number}"
     if len(poses) > MOST_SUBMAP_KEYSCANS:
         raise PacketError(f"{name} has {len(poses)} keyscans, at most {MOST_SUBMAP_KEYSCANS}")

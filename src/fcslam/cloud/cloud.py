@@ -38,11 +38,7 @@ class Cloud(FleetHost):
         """How many corrections were sent: the version of the next one."""
 
     def receive(self, data: bytes) -> list[bytes]:
-        """As ``apply``, with encoded packets.
-
-        Raises:
-            PacketError: as there, or ``data`` is not a packet.
-        """
+        """As ``apply``, with encoded packets."""
         return [encode(reply) for reply in self.apply(decode(data))]
 
     def apply(self, packet: Packet) -> list[Packet]:
@@ -86,7 +82,6 @@ class Cloud(FleetHost):
         return replies(robot, state, known, {})
 
     def _corrected(self, packet: Packet, session: str) -> SessionCorrection | None:
-        """The session's correction if it is news."""
         estimate, last = self.fleet.correction(session), self._corrections.get(session)
         if estimate is None or not is_news(last.correction if last else None, estimate):
             return None

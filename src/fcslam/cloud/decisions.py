@@ -195,7 +195,6 @@ class ClosureDecisions:
         return before != (entry.vetoed, entry.pinned)
 
     def _is_vetoed(self, entry: ClosureEntry) -> bool:
-        """Whether a veto excludes the closure, an end is removed, a scan behind it is cut, or its edit is undone."""
         if entry.made_by_hand is not None and entry.made_by_hand not in self._changes:
             return True
         i, j = ((end.robot, self._sessions.stamp(end)) for end in (entry.closure.i, entry.closure.j))
@@ -220,7 +219,6 @@ class ClosureDecisions:
         return False
 
     def _is_pinned(self, entry: ClosureEntry) -> bool:
-        """Whether a user says that the closure is true, or made it."""
         i, j = entry.closure.i, entry.closure.j
         pins = [change for change in self._changes if isinstance(change, Pin)]
         return entry.made_by_hand is not None or any(
@@ -247,11 +245,9 @@ class ClosureDecisions:
         ]
 
     def _has_passed(self, session: str, stamp: float) -> bool:
-        """Whether the session has a keyscan at this time or later."""
         return bool(self._sessions.stamps(session)[-1] >= stamp)
 
     def _ends(self, made: ManualClosure) -> tuple[KeyscanId, KeyscanId]:
-        """The keyscans that a closure by hand connects."""
         return self._sessions.nearest(made.robot_i, made.stamp_i), self._sessions.nearest(made.robot_j, made.stamp_j)
 
     def _scans(self, end: KeyscanId) -> Scans:
@@ -278,7 +274,6 @@ class ClosureDecisions:
         return False
 
     def _decide_pair(self, a: str, b: str) -> None:
-        """Decide all closures again if those between two sessions could join their maps, or bend or separate a map."""
         entries, pair = self.closures.evidence(a, b), frozenset((a, b))
         if len(entries) < self._due.get(pair, 0):
             return
@@ -326,7 +321,6 @@ class ClosureDecisions:
 
 
 def _separated(before: Sequence[Sequence[str]], after: Sequence[Sequence[str]]) -> list[tuple[list[str], list[str]]]:
-    """Groups of sessions that were in one map before and are in two after."""
     pairs = []
     for sessions in before:
         parts = [part for map_ in after if (part := [session for session in map_ if session in sessions])]
@@ -335,7 +329,6 @@ def _separated(before: Sequence[Sequence[str]], after: Sequence[Sequence[str]]) 
 
 
 def _explain(entries: Iterable[ClosureEntry], reason: Reason) -> None:
-    """State why closures that are still only verified were not accepted."""
     for entry in entries:
         if entry.closure.status is ClosureStatus.VERIFIED:
             entry.set(ClosureStatus.VERIFIED, reason)

@@ -71,11 +71,7 @@ def in_force(edits: Sequence[Edit]) -> tuple[Change, ...]:
 
 
 def check_undo(edits: Sequence[Edit], number: int) -> None:
-    """Check that edit ``number`` can be undone.
-
-    Raises:
-        InputError: it is not there, is an undo, or was undone before.
-    """
+    """Check that edit ``number`` can be undone."""
     named = next((edit for edit in edits if edit.number == number), None)
     if named is None:
         raise InputError(f"there is no edit {number}; there are {len(edits)}")
@@ -144,11 +140,7 @@ def edit_json(content: Change | Undo) -> str:
 
 
 def read_edit(kind: str, content: str) -> Change | Undo:
-    """The content of an edit of this kind, checked.
-
-    Raises:
-        InputError: it is not what ``edit_json`` writes, or cannot be meant.
-    """
+    """The content of an edit of this kind, checked."""
     try:
         _KINDS[kind](**json.loads(content))  # refuses names that the kind does not have
         edit = _READERS[kind].validate_json(content, strict=True)
@@ -165,11 +157,7 @@ def read_edit(kind: str, content: str) -> Change | Undo:
 
 
 def check_edit(content: Change | Undo) -> None:
-    """Check the numbers and names of an edit.
-
-    Raises:
-        InputError: one cannot be meant.
-    """
+    """Check the numbers and names of an edit."""
     if not all(isfinite(number) for number in _numbers(asdict(content))):
         raise InputError("a number of the edit is not finite")
     unnamed = next((name for name in sessions_of(content) if not NAME.fullmatch(name)), None)
@@ -203,11 +191,7 @@ def _check_closure(closure: ManualClosure) -> None:
 
 
 def check_polygon(corners: Sequence[tuple[float, float]]) -> None:
-    """Check that a polygon of corners (x, y), metres, has an inside.
-
-    Raises:
-        InputError: it has not, or a coordinate is out of range.
-    """
+    """Check that a polygon of corners (x, y), metres, has an inside."""
     if not 3 <= len(corners) <= MOST_CORNERS:
         raise InputError(f"a polygon has 3 to {MOST_CORNERS} corners, not {len(corners)}")
     _check_coordinates(chain.from_iterable(corners))
@@ -231,7 +215,6 @@ def _check_coordinates(coordinates: Iterable[float]) -> None:
 
 
 def _numbers(content: Any) -> Iterable[float]:
-    """All numbers in it, also those in lists."""
     if isinstance(content, dict | list | tuple):
         values = content.values() if isinstance(content, dict) else content
         return chain.from_iterable(map(_numbers, values))

@@ -48,8 +48,6 @@ from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 
 
 class _Replayed(NamedTuple):
-    """Packets that were applied in canonical order, and the state of a fleet after them."""
-
     order: list[PacketNumber]
     state: State
 
@@ -266,15 +264,12 @@ class Fleet:
         return self._decisions.counts()
 
     def _present(self) -> list[str]:
-        """Sessions with a keyscan that are not removed, in the order of their first."""
         return [session for session in self._sessions.robots if not is_removed(session, self._decisions.changes)]
 
     def _present_maps(self) -> list[list[str]]:
-        """The maps of these; a removed session is in a map of its own."""
         return [map_ for map_ in self._decisions.maps if not is_removed(map_[0], self._decisions.changes)]
 
     def _present_closures(self) -> list[ClosureEntry]:
-        """The closures of sessions that are not removed."""
         present = set(self._present())
         return [e for e in self._decisions.closures if {e.closure.i.robot, e.closure.j.robot} <= present]
 
@@ -308,7 +303,6 @@ class Fleet:
             self._decisions.start_map(keyscan.id.robot)
 
     def _add_sighting(self, sighting: TagSighting) -> None:
-        """Match a sighting with those of the same tag, decide about the closures, join maps, optimize."""
         session = sighting.id.robot
         matches = self._tags.add(sighting)
         for match in matches:
@@ -327,7 +321,6 @@ class Fleet:
         check_submap(place, self._graph.chain(robot, place.first, place.last))
 
     def _add_place(self, place: Place) -> None:
-        """Match a place (Algorithm 1), decide about its closures, join maps, optimize."""
         session, decisions = place.id.robot, self._decisions
         matches: list[PlaceMatch] = []
         if self._config.join_maps and self._sessions.hold(place):

@@ -49,8 +49,6 @@ RIVALS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Near:
-    """The scans of one session around a point."""
-
     scans: Sequence[tuple[PointScan, FloatArray]]
     """With their poses in the frame of the anchor."""
     anchor: KeyscanId
@@ -64,8 +62,6 @@ class _Near:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Compared:
-    """A comparison of the maps of two sessions."""
-
     i: KeyscanId
     j: KeyscanId
     T_i_j: FloatArray
@@ -258,7 +254,6 @@ class _LocalMaps:
         return total(agreements)
 
     def _at(self, side: int, row: int) -> LocalSubmap | None:
-        """The local map around a keyscan of one of the sessions; None with too few keyscans."""
         if (side, row) not in self._built:
             session, poses = self._sessions[side], self._poses[side]
             keyscans = self._keyscans_around(session, poses, poses[row, :2], LOCAL_M, MOST_LOCAL_KEYSCANS)
@@ -278,7 +273,6 @@ def _separate(poses: FloatArray, rows: NDArray[np.int64], apart_m: float) -> NDA
 
 
 def _at_most(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """The rows, or ``most`` evenly spaced ones."""
     return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
 
 

@@ -159,7 +159,6 @@ class PlaceRecognition:
         self._arrivals += 1
 
     def _forget(self, place: Place) -> None:
-        """Release what only a place needs that is never compared again."""
         vocabulary_session = self._key(place), place.id.robot
         stored = self._places[vocabulary_session]
         self._places[vocabulary_session] = stored[stored[:, 0] != place.id.number]
@@ -208,7 +207,6 @@ class PlaceRecognition:
                     yield match
 
     def _from_start(self, session: str, numbers: NDArray[np.int64]) -> FloatArray:
-        """Poses (N, 3) of keyscans from the first one of their session."""
         poses = self._graph.trajectory(session)
         return se2.between(poses[0], poses[numbers])
 
@@ -226,6 +224,5 @@ class PlaceRecognition:
 
 
 def _outside(mates: Collection[str]) -> Callable[[KeyscanId], bool]:
-    """Whether a place belongs to a session in another map."""
     known = frozenset(mates)
     return lambda place: place.robot not in known

@@ -101,7 +101,6 @@ def _evidence(graph: JointGraph, entries: list[ClosureEntry]) -> JointEvidence:
 
 
 def _with_certain(graph: PoseGraph, certain: list[int]) -> PoseGraph:
-    """The same graph, in which these closures count like odometry."""
     edges = graph.given()
     robust = edges.robust.copy()
     robust[certain] = False
@@ -109,7 +108,6 @@ def _with_certain(graph: PoseGraph, certain: list[int]) -> PoseGraph:
 
 
 def _decide(entry: ClosureEntry, holds: bool, fits: Reason, contradiction: Reason) -> None:
-    """Set the entry's status, for the first reason if it holds and for the second one if it does not."""
     accepted_before = entry.closure.status is ClosureStatus.ACCEPTED
     if entry.vetoed:
         entry.set(ClosureStatus.REVOKED, Reason(ReasonCode.VETOED))
@@ -125,7 +123,6 @@ def _decide(entry: ClosureEntry, holds: bool, fits: Reason, contradiction: Reaso
 
 
 def _reasons(solution: JointSolution, robots: list[str]) -> dict[frozenset[str], Reason]:
-    """By pair of robots, why their closures do not join their maps."""
     short = {
         frozenset((robots[link.a], robots[link.b])): link.decision.shortfall.under(CONSISTENCY)
         for link in solution.links

@@ -134,7 +134,6 @@ def _link_metrics(link: str, traffic: Mapping[str, Traffic], tracks: Mapping[str
 
 
 def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig) -> LocalMap:
-    """The robot's own map, made without other robots."""
     fused = fuse(robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.lasers}, grid)
     name = f"{robot.robot}.pgm"
     return LocalMap(
@@ -177,7 +176,6 @@ def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> Closur
 def _map_files(
     result: FleetResult, trajectories: Mapping[str, RobotTrajectory], maps: Mapping[int, OccupancyMap]
 ) -> dict[str, bytes]:
-    """map.* of the largest map, map_<k>.* of robots that are not connected to it."""
     files: dict[str, bytes] = {}
     for k, fused in maps.items():
         stem = map_stem(k)

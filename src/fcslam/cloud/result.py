@@ -150,7 +150,6 @@ def conclude(
 
 
 def _placed(fusion: Fusion, sessions: SessionStore, changes: Sequence[Change]) -> Fusion:
-    """The same with every map where users want it."""
     T_map_base = dict(fusion.T_map_base)
     for members in fusion.maps:
         T = T_placed_map(members, sessions, fusion.pose, changes)

@@ -126,7 +126,6 @@ def _join(robots: tuple[str, str], T_a_b: FloatArray, maps: list[list[str]], fra
 
 
 def _closure(entry: ClosureEntry, used: Mapping[ClosureEntry, Reason]) -> LoopClosure:
-    """The closure with its final status."""
     if not entry.is_between or entry.closure.status is ClosureStatus.CANDIDATE:
         return entry.closure
     if entry.vetoed:

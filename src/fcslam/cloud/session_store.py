@@ -31,8 +31,6 @@ _Body = TypeVar("_Body", Hello, Keyscan)
 
 @dataclass(slots=True)
 class _KeptKeyscan:
-    """A keyscan in memory, or where it is."""
-
     stamp: float
     sequence: int
     """Number of its packet."""
@@ -45,8 +43,6 @@ class _KeptKeyscan:
 
 @dataclass(slots=True)
 class _Session:
-    """What one session sent."""
-
     hello: Hello
     """The newest one."""
     hello_sequence: int
@@ -91,9 +87,6 @@ class SessionStore:
         """Note how to read the session's packets: at its start, or because there is a new detector or one more laser.
 
         ``sequence`` is the number of its packet.
-
-        Raises:
-            PacketError: an announced laser is missing or changed, or the floor is another one.
         """
         session = self._sessions.get(hello.robot)
         if session is None:
@@ -106,11 +99,7 @@ class SessionStore:
         session.announced.update(hello.detector_versions.items())
 
     def add_keyscan(self, keyscan: Keyscan, sequence: int) -> None:
-        """The robot's next keyscan; ``sequence`` is the number of its packet.
-
-        Raises:
-            PacketError: it is not the next, does not fit the laser, or the motion to the one before is missing.
-        """
+        """The robot's next keyscan; ``sequence`` is the number of its packet."""
         robot, number = keyscan.id
         session = self._sessions.get(robot)
         if session is None:
@@ -126,11 +115,7 @@ class SessionStore:
             self._sessions[robot] = self._sessions.pop(robot)
 
     def add_motion(self, motion: Constraint) -> None:
-        """Connect the newest keyscan to the one before.
-
-        Raises:
-            PacketError: it does not, the keyscan has one already, or no robot moves or measures like this.
-        """
+        """Connect the newest keyscan to the one before."""
         robot, session = motion.robot, self._sessions.get(motion.robot)
         new = len(session.keyscans) - 1 if session is not None else 0
         if session is None or session.connected != new or (motion.i, motion.j) != (new - 1, new):
@@ -142,11 +127,7 @@ class SessionStore:
         session.T_odom_base, session.connected = T_odom_base, new + 1
 
     def add_place(self, place: Place) -> None:
-        """A place of the robot.
-
-        Raises:
-            PacketError: its keyscans are not there, this detector described it before, or was not announced.
-        """
+        """A place of the robot."""
         self.require(place.id, KeyscanId(place.id.robot, place.last))
         robot, number = place.id
         session = self._sessions[robot]
@@ -164,11 +145,7 @@ class SessionStore:
         session.spans[number, place.channel] = min(first, place.first), max(last, place.last)
 
     def add_fix(self, fix: KeyscanFix) -> None:
-        """A fix of satellite navigation.
-
-        Raises:
-            PacketError: its keyscan is not there, or has one already.
-        """
+        """A fix of satellite navigation."""
         self.require(fix.id)
         robot, number = fix.id
         fixes = self._sessions[robot].fixes
@@ -181,11 +158,7 @@ class SessionStore:
         return tuple(self._sessions[robot].fixes.values())
 
     def require(self, *ids: KeyscanId) -> None:
-        """Check that the keyscans are there.
-
-        Raises:
-            PacketError: one is not.
-        """
+        """Check that the keyscans are there."""
         for robot, number in ids:
             if not (robot in self._sessions and 0 <= number < self._sessions[robot].connected):
                 raise PacketError(f"{robot}: names keyscan {number}, which it never sent")
@@ -290,7 +263,6 @@ class SessionStore:
         return kept.keyscan
 
     def _stored(self, number: PacketNumber, kind: type[_Body]) -> _Body:
-        """The content of a stored packet."""
         assert self._read is not None, "only a restored store names packets"
         body = in_session(self._read(number)).body
         assert isinstance(body, kind), "a packet never changes"

@@ -40,11 +40,7 @@ def robot_and_epoch(session: str) -> tuple[str, int]:
 
 
 def check_robot(robot: str) -> None:
-    """Refuse a robot whose name cannot be used, or is that of another robot's session.
-
-    Raises:
-        PacketError: it is not a name, or ends in ``+`` and digits.
-    """
+    """Refuse a robot whose name cannot be used, or is that of another robot's session."""
     check_name(robot, "robot")
     taken = _SESSION.fullmatch(robot)
     if taken:
@@ -52,11 +48,7 @@ def check_robot(robot: str) -> None:
 
 
 def in_session(packet: Packet) -> Packet:
-    """The packet with the session's name in place of the robot's.
-
-    Raises:
-        PacketError: the robot is called like a session of another one.
-    """
+    """The packet with the session's name in place of the robot's."""
     check_robot(packet.robot)
     if packet.epoch == 0:
         return packet

@@ -16,8 +16,6 @@ UNPACKED: Final = 250
 
 @dataclass(slots=True)
 class _Entry:
-    """The submap around a place, and values derived from it; None until they are needed."""
-
     packed: PackedSubmap | None = None
     noise: float | None = None
 

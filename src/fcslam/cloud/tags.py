@@ -61,11 +61,7 @@ class SeenTags:
         """Ends of closures by tags between two sessions."""
 
     def add(self, sighting: TagSighting) -> list[PlaceMatch]:
-        """Note a sighting; returns its closures with earlier ones.
-
-        Raises:
-            PacketError: its keyscan is not there, saw the tag before or saw too many, or the tag is too far away.
-        """
+        """Note a sighting; returns its closures with earlier ones."""
         self._sessions.require(sighting.id)
         check_sighting(sighting)
         session, number = sighting.id
@@ -122,7 +118,6 @@ class SeenTags:
 
 
 def _match(i: TagSighting, j: TagSighting) -> PlaceMatch:
-    """The closure of two sightings."""
     T_i_j: FloatArray = frozen(se2.compose(i.T_base_tag, se2.inverse(j.T_base_tag)))
     moved = se2.adjoint(j.T_base_tag)
     covariance = moved @ (np.linalg.inv(i.information) + np.linalg.inv(j.information)) @ moved.T

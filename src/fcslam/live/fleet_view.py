@@ -148,12 +148,7 @@ class FleetView:
         return tuple((one.maps, one.explanation) for one in apart)
 
     def step(self) -> None:
-        """Ask once.
-
-        Raises:
-            UnavailableError: the cloud cannot be reached now.
-            CloudError: the cloud rejects the robot.
-        """
+        """Ask once."""
         client, own = self._clients[self._current], self._own_pose()
         pose = None if own is None or not np.isfinite(own[1]).all() else tuple(own[1].tolist())
         reply = client.exchange(self._robot, None if own is None else own[0], pose), self.clock()
@@ -197,7 +192,6 @@ class FleetView:
                 wait_s = getattr(error, "retry_after_s", 0.0) + POLL_S + retry_delay_s(self._failures, self._rng)
 
     def _tell(self, before: MapTeammates | None, now: MapTeammates | None) -> None:
-        """Note one line if the robots of the map changed."""
         known = {one.robot for one in self.robots()}
         earlier, others = (frozenset() if one is None else one.robots for one in (before, now))
         if earlier == others and (before is None) == (now is None):

@@ -43,7 +43,6 @@ _ScanKey = tuple[float, tuple[float, float, float], int]
 
 
 def _key(stamp: float, laser: LaserModel) -> _ScanKey:
-    """What distinguishes the scans of one robot: several lasers may scan at once."""
     return stamp, laser.T_base_laser, laser.beam_count
 
 

@@ -5,17 +5,18 @@ which is another process, so no pose waits for them.
 """
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fcslam.api import settings_of
-from fcslam.errors import InputError
+from fcslam.errors import FcslamError, InputError
 from fcslam.geometry import se2
+from fcslam.lidar.frozen_map import frozen_map
 from fcslam.live.inputs import Lasers
 from fcslam.live.records import WIRED, EventKind, RobotEvent, RobotPose, RobotStatus, Wiring
 from fcslam.live.tracker import LiveTracker
@@ -23,15 +24,23 @@ from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.localization import LocalizedDrive, pose_in_map, read_map
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import FloatArray, StrPath, frozen
+from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd
+from fcslam.robot.backend_runner import WorkerObject
 from fcslam.robot.frontend import NewestScan, RobotFrontend
-from fcslam.robot.map_localizer import MapEstimate
-from fcslam.robot.worker_localizer import WorkerLocalizer
+from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.warmup import warm_up_tracking
-from fcslam.wire.messages import Packet
+from fcslam.wire.messages import Body, Packet
 
 _NOWHERE = MapEstimate(frozen(np.full(3, np.nan)), frozen(np.full((3, 3), np.nan)), 0.0)
 """The estimate of a robot that is not localized."""
+
+
+class _Found(NamedTuple):
+    estimate: MapEstimate | None
+    """None: the robot was not localized."""
+    fixes: int
+    losses: int
 
 
 class LocalizedRobot(LiveTracker):
@@ -85,17 +94,20 @@ class LocalizedRobot(LiveTracker):
         initial = None if initial_pose is None else pose_in_map("initial_pose", initial_pose, self._map)
         self._drive = LocalizedDrive()
         self._was_localized = False
+        self._found, self._found_session = _Found(None, 0, 0), 0
+        """The newest result of the worker, and its session: ``odom`` is another frame in each."""
+        self._keyscans = self._submitted_sessions = 0
         robot = self._config.robot
         with ExitStack() as stack:
             executor = self._executor = wiring.started(stack)
             try:
-                self._localizer = WorkerLocalizer(self.name, self._map, initial, executor)
+                self._localizer = WorkerObject(executor, f"localizer of {name}", _localizer, self._map, initial)
             except BrokenExecutor as error:
                 raise InputError(
                     f"{self.name}: the process that searches the map does not start; a script that makes a "
                     'LocalizedRobot needs `if __name__ == "__main__":` around its own code'
                 ) from error
-            self._frontend = RobotFrontend(self.name, robot, self._localizer)
+            self._frontend = RobotFrontend(self.name, robot, self._submit)
             warm_up_tracking(robot)
             self._stack = stack.pop_all()
 
@@ -107,15 +119,12 @@ class LocalizedRobot(LiveTracker):
 
         Args:
             pose: (x, y, theta) of ``base`` in the map, metres and radians.
-
-        Raises:
-            InputError: it is not a pose, or outside of the map.
         """
         T_map_base = pose_in_map("pose", pose, self._map)
         with self._lock:
             newest = self._frontend.newest
             here = np.zeros(3) if newest is None else self._frontend.scan_poses.in_odom(newest.pose)
-            self._localizer.suggest(se2.compose(T_map_base, se2.inverse(here)))
+            self._queue(MapLocalizer.suggest, se2.compose(T_map_base, se2.inverse(here)))
 
     def status(self) -> RobotStatus:
         """Return the state of the robot: whether it knows its pose, and counts since its start."""
@@ -124,9 +133,9 @@ class LocalizedRobot(LiveTracker):
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         return RobotStatus(
             scans=self._scans,
-            keyscans=self._localizer.keyscans,
+            keyscans=self._keyscans,
             map_index=0,
-            times_lost=self._localizer.state.losses,
+            times_lost=self._found.losses,
             quality=0.0 if estimate is None else estimate.quality,
             notices=tuple(filter(None, (broken, jumps))),
             is_localized=estimate is not None,
@@ -165,21 +174,36 @@ class LocalizedRobot(LiveTracker):
 
         Returns:
             The run that was written.
-
-        Raises:
-            InputError: the folder cannot be written.
         """
         prepare_output(Path(folder), force)
-        state = self._localizer.state
         with self._lock:
-            run = self._drive.run(self.name, self._map, self._config, state.fixes, state.losses)
+            run = self._drive.run(self.name, self._map, self._config, self._found.fixes, self._found.losses)
         run.save(folder, force)
         return run
 
     def _estimate(self) -> MapEstimate | None:
-        """Where the present session's ``odom`` lies in the map."""
-        state = self._localizer.state
-        return state.estimate if state.session == self._session else None
+        return self._found.estimate if self._found_session == self._session else None
+
+    def _submit(self, input: BackendInput) -> "Future[list[Body]]":
+        self._keyscans += isinstance(input, NewKeyscan)
+        self._submitted_sessions += isinstance(input, SessionEnd)
+        return self._queue(MapLocalizer.submit, input)
+
+    def _queue(self, method: Callable[..., object], argument: object) -> "Future[list[Body]]":
+        handled: Future[list[Body]] = Future()
+        session = self._submitted_sessions
+
+        def take(done: "Future[_Found]") -> None:
+            error = FcslamError("the robot was closed") if done.cancelled() else done.exception()
+            if error is None:
+                self._found, self._found_session = done.result(), session
+                handled.set_result([])
+            else:  # nobody follows the robot any more
+                self._found = self._found._replace(estimate=None)
+                handled.set_exception(error)
+
+        self._localizer.call(_after, method, argument).add_done_callback(take)
+        return handled
 
     def _take(self, packets: list[Packet]) -> None:
         """Nothing leaves a robot that makes no map."""
@@ -210,3 +234,12 @@ class LocalizedRobot(LiveTracker):
             self._event(EventKind.LOST, "not localized any more: the walls are others than in the map")
         if self._frontend.packets.failure:
             self._tell_failure(f"not localized from now on, as the search failed: {self._frontend.packets.failure}")
+
+
+def _localizer(occupancy: OccupancyMap, initial: FloatArray | None) -> MapLocalizer:
+    return MapLocalizer(frozen_map(occupancy, "the map"), initial)
+
+
+def _after(localizer: MapLocalizer, method: Callable[..., object], argument: object) -> _Found:
+    method(localizer, argument)
+    return _Found(localizer.estimate, localizer.fixes, localizer.losses)

@@ -18,7 +18,7 @@ from fcslam.errors import FcslamError
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.mission import MissionCloud, MissionConfig
 from fcslam.records import Correction, FloatArray
-from fcslam.robot.worker_object import WorkerObject
+from fcslam.robot.backend_runner import WorkerObject
 from fcslam.runs import Run
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import SizedPacket, decode, measure

@@ -42,7 +42,7 @@ from fcslam.records import (
     checked_pose,
     frozen,
 )
-from fcslam.robot.backend_runner import WorkerBackend
+from fcslam.robot.backend_runner import in_worker
 from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.keyframe_folder import KEYFRAMES
@@ -211,9 +211,6 @@ class Robot(LiveTracker):
 
         Args:
             floor: as for the robot itself.
-
-        Raises:
-            InputError: it is not a floor.
         """
         _check_floor(floor)
         with self._lock:
@@ -247,10 +244,6 @@ class Robot(LiveTracker):
 
         Returns:
             The occupancy of each cell, shape (H, W), the side of a cell and the lower left corner in ``map``.
-
-        Raises:
-            InputError: the robot has no map of its own.
-            FcslamError: the worker has ended.
         """
         joint = self.joint_map()
         return self.own_map() if joint is None else joint
@@ -272,10 +265,6 @@ class Robot(LiveTracker):
 
         Returns:
             As ``map``.
-
-        Raises:
-            InputError: the robot has no map of its own.
-            FcslamError: the worker has ended.
         """
         own = self._require_own_map()
         self._catch_up()
@@ -284,12 +273,7 @@ class Robot(LiveTracker):
         return own.draw(self._session_name(session), self._map_poses.T_map_own(session))
 
     def closures(self) -> FloatArray:
-        """Both ends of each loop closure that holds in the robot's map, shape (N, 2, 2), metres in ``map``.
-
-        Raises:
-            InputError: the robot has no map of its own.
-            FcslamError: the worker has ended.
-        """
+        """Both ends of each loop closure that holds in the robot's map, shape (N, 2, 2), metres in ``map``."""
         own = self._require_own_map()
         with self._lock:
             session = self._session
@@ -300,9 +284,6 @@ class Robot(LiveTracker):
 
         With a map of its own, the poses are corrected by all loop closures so far. Without, all move with the server's
         newest correction.
-
-        Raises:
-            FcslamError: the worker has ended.
         """
         self._catch_up()
         with self._lock:
@@ -359,10 +340,6 @@ class Robot(LiveTracker):
     def idle(self) -> None:
         """Write where the keyframes are, for a process that learns from them, and take a detector that the server
         announced meanwhile. Call it while no scan is due.
-
-        Raises:
-            CloudError: the server rejects the robot.
-            InputError: the state folder cannot be used.
         """
         self._raise_failure()
         with self._lock:
@@ -376,10 +353,6 @@ class Robot(LiveTracker):
     def wait_for_room(self, watch: Callable[[RobotStatus], None] | None = None) -> None:
         """Wait until the back end, the map, the disk and the server have caught up enough to take more, for a program
         that adds records faster than a robot.
-
-        Raises:
-            CloudError: the server rejects the robot.
-            InputError: the state folder cannot be used.
         """
         self._raise_failure()
         while self._is_behind():
@@ -395,11 +368,6 @@ class Robot(LiveTracker):
 
         Returns:
             The run that was written.
-
-        Raises:
-            InputError: the folder cannot be written.
-            InputError: the robot has no map of its own, or no scan was added.
-            FcslamError: the worker has ended.
         """
         own = self._require_own_map()
         prepare_output(Path(folder), force)
@@ -418,13 +386,11 @@ class Robot(LiveTracker):
         return session_name(self.name, self._first_session + session)
 
     def _start(self, executor: Executor, outbox: Outbox | None, own_map: bool, keyframes: Path | None) -> None:
-        """Start the back end, which keeps keyframes in a folder if there is one, and the robot's own map, which goes on
-        from the earlier sessions in ``outbox``."""
         robot = self._config.robot
         self._first_session = first = 0 if outbox is None else outbox.first_epoch
         try:
             self._own = OwnMap(self.name, self._config, executor, self._correct, first) if own_map else None
-            backend = WorkerBackend(self.name, robot, executor, keyframes)
+            backend = in_worker(self.name, robot, executor, keyframes)
             self._frontend = RobotFrontend(self.name, robot, backend, self._mark_teammates)
         except BrokenExecutor as error:
             raise InputError(
@@ -488,12 +454,10 @@ class Robot(LiveTracker):
             self._own.put(packets)
 
     def _place(self) -> tuple[int, FloatArray] | None:
-        """Index of the robot's map and its pose there, in any thread."""
         pose = self._pose
         return None if pose is None or pose.map_index is None else (pose.map_index, pose.T_map_base)
 
     def _correct(self, session: int, correction: Correction) -> None:
-        """Take a correction of the robot's own map, in any thread."""
         self._map_poses.correct(session, correction, self._is_server_away())
 
     def _is_server_away(self) -> bool:
@@ -579,11 +543,6 @@ def _check_floor(floor: str) -> None:
 
 
 def _keyframe_folder(state: Path | None, playback: Playback) -> Path:
-    """The folder of the keyframes of this start.
-
-    Raises:
-        InputError: the robot has no state folder.
-    """
     if state is None:
         raise InputError("a robot that learns keeps keyframes; give --state, in Python state=")
     folder = state / KEYFRAMES
@@ -593,11 +552,6 @@ def _keyframe_folder(state: Path | None, playback: Playback) -> Path:
 
 
 def _state_folder(given: StrPath | None, is_needed: bool, stack: ExitStack) -> Path | None:
-    """The state folder, made if it is not there; one that is removed with ``stack`` if none is given and needed.
-
-    Raises:
-        InputError: it cannot be made.
-    """
     if given is None:
         return Path(stack.enter_context(TemporaryDirectory(prefix="fcslam-"))) if is_needed else None
     folder = Path(given)

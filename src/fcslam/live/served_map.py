@@ -26,11 +26,6 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
 
     Returns:
         None; or why the cloud cannot be reached, if ``folder`` holds an earlier copy, which then stays as it is.
-
-    Raises:
-        CloudError: the cloud rejects the robot, or it cannot be reached and there is no earlier copy.
-        SourceError: the cloud has no map.
-        InputError: ``folder`` is something else than a run folder, or cannot be written.
     """
     prepare_output(folder, force=True)
     troubles = []
@@ -48,7 +43,6 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
 
 
 def _read(client: MapClient, server: str) -> Run:
-    """The maps of a cloud, all of one moment."""
     for _ in range(_ATTEMPTS):
         served = [one for one in client.maps() if one.extent_m]
         if not served:

@@ -51,11 +51,7 @@ class LiveTracker(ABC):
     def __init__(
         self, name: str, laser: Lasers | None, config: MissionConfig, on_event: Callable[[RobotEvent], None] | None
     ) -> None:
-        """Check the arguments; the subclass starts the front end.
-
-        Raises:
-            InputError: the name or a laser cannot be used.
-        """
+        """Check the arguments; the subclass starts the front end."""
         self.name = checked_robot(name)
         self._lasers = checked_lasers(laser)
         self._config = config
@@ -125,9 +121,6 @@ class LiveTracker(ABC):
         """Add the next record of any sensor, as a recording yields them; returns the pose of a scan.
 
         The caller vouches for the record: unlike ``add_scan``, this checks nothing.
-
-        Raises:
-            InputError: the robot is finished.
         """
         with self._lock:
             if isinstance(record, LaserScan):
@@ -155,7 +148,6 @@ class LiveTracker(ABC):
 
     @property
     def _session(self) -> int:
-        """Number of the present session, from 0."""
         return len(self._frontend.tracks) - 1
 
     def _processed(self, record: SensorRecord) -> list[Packet]:
@@ -215,7 +207,6 @@ class LiveTracker(ABC):
                 self._tell_failure(f"{found}; not corrected")
 
     def _tell_failure(self, text: str) -> None:
-        """Tell a failure once."""
         if text not in self._told:
             self._told.add(text)
             self._event(EventKind.FAILED, text)

@@ -25,8 +25,6 @@ from fcslam.wire.packets import SizedPacket, decode, measure, readdress
 SCANS_PER_LEG: Final = 50
 LEGS_PER_TRIM: Final = 4
 """Legs after which freed memory goes back to the system: the arrays of a submap leave gaps that others do not fill."""
-INPUTS_PER_BLOCK: Final = 8
-"""Inputs that go together to a back end beside the robot."""
 MOST_WAITING: Final = 64
 """Inputs that wait for a back end beside the robot; with more, the robot waits."""
 
@@ -93,11 +91,10 @@ def side_by_side(processes: int) -> Drive:
 
 @contextmanager
 def _with_backend_beside(source: Source, config: RobotConfig) -> Iterator[Iterator[Leg]]:
-    """Drive one robot in this process, with its back end in another if the host allows one."""
     with ExitStack() as stack:
         backend = None
         with suppress(InputError):
-            backend = stack.enter_context(backend_process(source.name, config, INPUTS_PER_BLOCK))
+            backend = stack.enter_context(backend_process(source.name, config))
         yield legs(source, RobotFrontend(source.name, config, backend))
 
 

@@ -124,7 +124,7 @@ def run_localization(
         The believed poses as trajectory, and every pose with standard deviations and quality.
     """
     localizer = MapLocalizer(frozen_map(occupancy, "the map"), initial)
-    robot = RobotFrontend(source.name, config.robot, localizer)
+    robot = RobotFrontend(source.name, config.robot, localizer.submit)
     drive = LocalizedDrive()
     scans: dict[float, LaserScan] = {}
     for record in source.records():
@@ -231,7 +231,6 @@ class LocalizedDrive:
 
 
 def _place(robot: RobotFrontend, estimate: MapEstimate | None, drive: LocalizedDrive) -> None:
-    """Add the scans that were tracked since the last call, at the newest estimate."""
     track = robot.scan_poses
     for number in range(len(drive) - sum(len(track) for track in robot.tracks[:-1]), len(track)):
         drive.add(track[number].stamp, robot.travel_m, track.in_odom(track[number]), estimate)

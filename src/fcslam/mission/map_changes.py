@@ -32,8 +32,6 @@ STAMP_TOLERANCE_S: Final = 1e-6
 
 
 class _Seen(NamedTuple):
-    """Keyscans of one map of a run."""
-
     keyscans: list[Keyscan]
     T_map_base: FloatArray  # (N, 3)
     lasers: Mapping[str, Sequence[LaserModel]]

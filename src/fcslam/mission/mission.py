@@ -205,8 +205,6 @@ def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:
 
 
 class _Meter:
-    """Counts scans, keyscans and recorded time, and reports the progress."""
-
     def __init__(self, watch: Watch, cloud: MissionCloud, robots: Sequence[str]) -> None:
         self._watch = watch
         self._cloud = cloud

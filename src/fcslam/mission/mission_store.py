@@ -275,11 +275,7 @@ class MissionStore:
         return _read_correction(self._database.rows, robot, epoch)
 
     def edit(self, content: Change | Undo, author: str, time_s: float) -> Edit:
-        """Append an edit to the log.
-
-        Raises:
-            InputError: it undoes what cannot be undone.
-        """
+        """Append an edit to the log."""
         with self._database.transaction() as database:
             if isinstance(content, Undo):
                 check_undo(_edits(database.execute, 0), content.number)
@@ -288,11 +284,7 @@ class MissionStore:
         return Edit(number, author, time_s, content)
 
     def check_named(self, content: Change | Undo) -> None:
-        """Check that the sessions and moments that an edit names are in the mission, both of a closure on one floor.
-
-        Raises:
-            InputError: they are not.
-        """
+        """Check that the sessions and moments that an edit names are in the mission, both of a closure on one floor."""
         spans = {
             session_name(robot, epoch): (first, last)
             for robot, epoch, first, last in self._database.rows(
@@ -318,7 +310,6 @@ class MissionStore:
                 raise InputError(f"{' and '.join(named)} are on different floors, which no closure joins")
 
     def _floor(self, session: str) -> str:
-        """Floor that a session names; empty if none."""
         hello = self.newest_hello(*robot_and_epoch(session))
         return "" if hello is None else hello.floor
 
@@ -378,11 +369,7 @@ class MissionStore:
             database.insert(TRACKS, [row])
 
     def tracks(self) -> dict[tuple[str, int], Track]:
-        """The scans of every session whose scans are known, by robot and epoch.
-
-        Raises:
-            StoreError: they are broken.
-        """
+        """The scans of every session whose scans are known, by robot and epoch."""
         rows = self._database.rows("SELECT robot, epoch, stamps, keyscans, offsets FROM tracks", ())
         packed = unpacked = 0
         tracks: dict[tuple[str, int], Track] = {}
@@ -434,20 +421,12 @@ class MissionStore:
         ]
 
     def export(self, path: Path) -> None:
-        """Write the mission as one new file.
-
-        Raises:
-            StoreError: there is a file already, or it cannot be written.
-        """
+        """Write the mission as one new file."""
         self._database.export(path)
 
 
 def check_mission(path: Path) -> None:
-    """Refuse a file that is not an exported mission.
-
-    Raises:
-        StoreError: it is not what ``MissionStore.export`` writes.
-    """
+    """Refuse a file that is not an exported mission."""
     check_file(path, SCHEMA, VERSION)
     with (
         translate_errors(path),
@@ -488,7 +467,6 @@ def _remember(database: Transaction, name: str, value: str) -> None:
 
 
 def _next(database: Transaction, table: str, column: str) -> int:
-    """The number after the last one of a table."""
     return int(database.execute(f"SELECT coalesce(max({column}), 0) + 1 FROM {table}").fetchone()[0])
 
 
@@ -528,7 +506,6 @@ def _known(database: Transaction, packets: Sequence[StoredPacket]) -> dict[tuple
 
 
 def _track(stamps: bytes, keyscans: bytes, offsets: bytes) -> Track:
-    """Read the columns of a session's scans."""
     track = Track(
         frozen(np.frombuffer(stamps, "<f8")),
         np.frombuffer(keyscans, "<i8"),

@@ -118,10 +118,6 @@ class RobotBackend:
             robot: its name.
             config: its settings.
             keyframes: folder that keeps the keyframes, for a process that learns from them; None: they are not kept.
-
-        Raises:
-            InputError: the folder cannot be written.
-            FeatureError: the detector is a network whose weights cannot be used.
         """
         self._robot = robot
         self._config = config
@@ -173,7 +169,6 @@ class RobotBackend:
             self._place()
 
     def _place(self) -> None:
-        """Write the poses of the keyframes, if these are kept."""
         if self._folder is not None:
             self._folder.place(self._session.keyscan_poses())
         self._placed, self._unplaced = self._placed + self._unplaced, 0
@@ -188,8 +183,6 @@ class RobotBackend:
 
 
 class _Session:
-    """Maps one session of a robot."""
-
     def __init__(self, robot: str, epoch: int, view_extractor: ViewExtractor, config: SessionConfig) -> None:
         self.epoch = epoch
         self._robot = robot
@@ -248,7 +241,6 @@ class _Session:
         return [*announcement, *(body for submap in rest for body in self._submap_bodies(submap, submap in last))]
 
     def _submap_bodies(self, submap: FinishedSubmap, at_end: bool = False) -> list[Body]:
-        """Closures of a submap within this robot, its LiDAR place, and the camera places up to its anchor."""
         bodies: list[Body] = list(submap.closures)
         if Channel.LIDAR in self._config.channels:
             bodies.append(self._lidar_place(submap))

@@ -126,7 +126,6 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
 
 
 def _without_tf(found: Contradiction) -> str:
-    """What speaks against a laser whose mounting no option gives."""
     return found.line(
         "write the recording as a bag by `fcslam record` and map that, which corrects the mounting of one laser; or "
         "correct the signs of the odometry"
@@ -153,8 +152,6 @@ def _scans_of(laser: LaserModel, source: Source) -> Iterator[LaserScan]:
 
 
 class _Found(NamedTuple):
-    """What speaks against the scans of a laser."""
-
     facing: Contradiction | None
     floor: FloorLine | None
 
@@ -202,7 +199,6 @@ def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
 
 
 def _is_wrong(scale: Estimate | None) -> TypeGuard[Estimate]:
-    """Whether the odometry has certainly another scale than the scans."""
     return scale is not None and (scale.differs(1.0, 5.0 * LEAST_SCALE) or scale.differs(1.0, GROSS_SCALE, sigmas=3.0))
 
 
@@ -217,7 +213,6 @@ def _scale_lines(calibration: MotionCalibration, beams: Beams) -> Iterator[str]:
 
 
 def _turn_remedy(turn: float, beams: Beams) -> str:
-    """What to do about a robot whose turn by scans is ``turn`` of that by odometry."""
     wheels = "correct the distance of the wheels in its driver"
     stated_deg = math.degrees(beams.span_rad + beams.angle_increment_rad)
     span_deg = stated_deg / turn
@@ -233,7 +228,6 @@ def _scale_line(name: str, scale: Estimate, remedy: str) -> str:
 
 
 def _contradiction(scale: Estimate, beams: Beams) -> tuple[str, ...]:
-    """Lines that say what is wrong if the turns of the scans are not at all those of odometry."""
     if abs(scale.value + 1.0) < 0.3:
         return (
             "the scans turn against the odometry: the laser is mounted upside down, or the heading of the odometry has "
@@ -306,7 +300,6 @@ def _times(stated: Sweep | None, assumed_s: float) -> tuple[float, float]:
 
 
 def _stated_share(stated: Sweep | None, assumed_s: float) -> float:
-    """The stated duration of a scan per duration with which it is tracked."""
     if stated is None:
         return 0.0
     first_s, last_s = _times(stated, assumed_s)
@@ -383,7 +376,6 @@ def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], nom
 
 
 def _share(calibration: MotionCalibration) -> Estimate | None:
-    """Duration of a sweep per assumed duration, without the scale of the odometry's turns."""
     if calibration.sweep_share is None:
         return None
     scale = 1.0 if calibration.turn_scale is None else abs(calibration.turn_scale.value)

@@ -24,7 +24,7 @@ from fcslam.lidar.lost import LostConfig, has_moved_unseen
 from fcslam.lidar.tracker import TrackedScan, TrackingResult
 from fcslam.records import CameraImage, DetectorFile, GnssFix, LaserScan, SensorRecord
 from fcslam.robot.backend import BackendInput, NewDetector, PlaceKeyframes, RobotBackend, SessionConfig, SessionEnd
-from fcslam.robot.backend_runner import BackendRunner, InlineBackend
+from fcslam.robot.backend_runner import Submit, inline
 from fcslam.robot.deferred_scans import DeferredScans, Outcome
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.packet_queue import PacketQueue
@@ -64,7 +64,7 @@ class RobotFrontend:
         self,
         robot: str,
         config: RobotConfig,
-        backend: BackendRunner | None = None,
+        backend: Submit | None = None,
         mark: Callable[[LaserScan], LaserScan] = lambda scan: scan,
     ) -> None:
         """Start the first session.
@@ -81,7 +81,7 @@ class RobotFrontend:
         self.odometry = WheelOdometry()
         self._motion: Motion = self.odometry
         """Of the sessions from the next one on."""
-        self.packets = PacketQueue(robot, backend or InlineBackend(RobotBackend(robot, config)))
+        self.packets = PacketQueue(robot, backend or inline(RobotBackend(robot, config)))
         self.newest: NewestScan | None = None
         """The newest scan; None before the first."""
         self._config, self._mark = config, mark
@@ -168,7 +168,6 @@ class RobotFrontend:
         return self.ready(wait=True)
 
     def _begin_where_unconnected(self, scan: LaserScan) -> None:
-        """Begin a session if the next scan is on another floor, or the clock stepped back before it."""
         if scan.new_floor:
             self.change_floor(scan.new_floor)
         if is_clock_step(self._before_s, scan.stamp):
@@ -178,7 +177,6 @@ class RobotFrontend:
         self._before_s = self._before_s[1], scan.stamp
 
     def _predict(self, scan: LaserScan) -> LaserScan:
-        """Give the scan its predicted pose and the velocity of its sweep."""
         if self._motion is self.odometry and self.odometry.check.says_nothing(scan):
             self._begin_without_odometry()
         return self._session.place(scan, self._before)
@@ -197,7 +195,6 @@ class RobotFrontend:
                 self._describe(self.motion.place_image(record))
 
     def _process_scan(self, scan: LaserScan) -> None:
-        """Track a scan; then map it, or defer it while it is doubtful."""
         if self._session.awaits_second(scan):
             if not self._deferred:
                 self._await_second(scan)
@@ -236,7 +233,6 @@ class RobotFrontend:
         return scan
 
     def _defer(self, scan: LaserScan, tracking: TrackingResult) -> None:
-        """Defer a doubtful scan, until there are enough of them for a decision."""
         self._deferred.add_doubtful(scan, tracking, self._session)
         pose = self._session.lidar.scan_pose(scan.stamp, tracking.tracked)
         self.newest = NewestScan(pose, tracking.tracked, tracking.quality, is_deferred=True)
@@ -244,7 +240,6 @@ class RobotFrontend:
             self._decide()
 
     def _decide(self) -> None:
-        """Continue from what the deferred scans show."""
         match self._deferred.decide(self._session):
             case Outcome.SAME_PLACE_OTHER_MAP:
                 self._session.lidar.begin_local_map()
@@ -263,7 +258,6 @@ class RobotFrontend:
             self._map_deferred()
 
     def _map_deferred(self) -> None:
-        """Map the deferred records as if they had come one after the other."""
         for record in self._deferred.take():
             if isinstance(record, LaserScan):
                 self._map(record, self._session.lidar.localize(record))
@@ -271,7 +265,6 @@ class RobotFrontend:
                 self._describe(record)
 
     def _map_admitted(self, scan: LaserScan, tracking: TrackingResult) -> None:
-        """Map a scan that is not doubtful, after those that were."""
         if self._deferred:
             self._map_deferred()
             tracking = self._session.lidar.localize(scan)
@@ -295,7 +288,6 @@ class RobotFrontend:
             self._submit(view)
 
     def _end_session(self) -> None:
-        """End a session and begin the next, on the same floor."""
         self._submit(SessionEnd())
         self._begin(ScanTrack(self.scan_poses.floor))
 

@@ -86,7 +86,7 @@ class _Vote:
 
 
 class MapLocalizer:
-    """Localizes one robot by its keyscans; a ``BackendRunner`` for ``RobotFrontend``. It sends nothing."""
+    """Localizes one robot by its keyscans; ``submit`` is the back end of a ``RobotFrontend``. It sends nothing."""
 
     def __init__(self, frozen_map: Submap, initial: FloatArray | None = None) -> None:
         """Begin without a pose.
@@ -189,7 +189,6 @@ class MapLocalizer:
         return found.explained if found.overlap >= LEAST_OVERLAP else otherwise
 
     def _match(self, T_map_guess: FloatArray, keyscan: MappedKeyscan) -> FloatArray:
-        """The pose matched with the map, with the guess as prior."""
         points = keyscan.points.thinned(POINT_SPACING_M, POINT_LIMIT)
         prior: FloatArray = np.asarray(np.linalg.inv(self._covariance))
         # Errors of neighbouring points are correlated; the match counts them in full, so the prior is scaled instead.
@@ -230,13 +229,11 @@ class MapLocalizer:
         return agreement(self._submap(reach_m), self._map, T_map_base)
 
     def _submap(self, reach_m: float) -> Submap:
-        """The walls of the last metres, in the base of the newest keyscan."""
         newest = self._recent[-1]
         kept = [k for k in self._recent if k.travel_m >= newest.travel_m - reach_m]
         return build_submap([(k.points, se2.between(newest.T_local_base, k.T_local_base)) for k in kept])
 
     def _search(self, keyscan: MappedKeyscan) -> None:
-        """Align the walls of the newest stretch with the whole map."""
         from fcslam.lidar.uniqueness import two_best  # SciPy's transforms take long to load
 
         length_m = min(keyscan.travel_m - self._searched_m, LONGEST_STRETCH_M)
@@ -281,7 +278,6 @@ class MapLocalizer:
         self._begin_stretch(keyscan.travel_m)
 
     def _begin_stretch(self, travel_m: float) -> None:
-        """Begin a stretch: the next search uses the scans from here on."""
         self._searched_m, self._next_search_m = travel_m, travel_m + FIRST_SEARCH_M
 
     def _agree(self, one: "_Vote", other: "_Vote", keyscan: MappedKeyscan) -> bool:

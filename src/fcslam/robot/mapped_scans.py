@@ -62,7 +62,6 @@ def _mapped_laser(laser: LaserModel, step: int) -> LaserModel:
 
 
 def _mapped_sweep(sweep: Sweep | None, beam_count: int, step: int) -> Sweep | None:
-    """The sweep of every ``step``-th beam from the first on."""
     if sweep is None or step == 1:
         return sweep
     share = (beam_count - 1) // step * step / (beam_count - 1)

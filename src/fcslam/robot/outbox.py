@@ -95,7 +95,6 @@ class Outbox:
             raise
 
     def _check_waiting(self) -> None:
-        """Compare the waiting packets with their digests."""
         question = (
             "SELECT epoch, session, ordinal, sequence, digest, data FROM packets JOIN sessions USING (epoch) "
             f"WHERE {_IS_WAITING} ORDER BY epoch, sequence"
@@ -120,9 +119,6 @@ class Outbox:
 
         Returns:
             Number of packets that the front end will produce again; 0 if nothing is resumed.
-
-        Raises:
-            InputError: the last start read another recording.
         """
         with self._transaction() as connection:
             last, before = _one(connection, "SELECT max(epoch), recording FROM sessions WHERE session = 0")
@@ -235,9 +231,6 @@ class Outbox:
         Returns:
             Epoch and sequence number of waiting packets that the cloud can no longer use: those of earlier sessions
             whose first packets it had confirmed and does not have any more.
-
-        Raises:
-            InputError: the cloud does not have the first packets of the present epoch any more, or no epoch is left.
         """
         with self._transaction() as connection:
             newest = max(expected, default=-1)
@@ -292,7 +285,6 @@ class Outbox:
         return count
 
     def _move(self, connection: sqlite3.Connection, epoch: int, to: int) -> None:
-        """Move a session of which the cloud has no packet to another epoch."""
         rows = connection.execute("SELECT ordinal, sequence, data FROM packets WHERE epoch = ?", (epoch,)).fetchall()
         for ordinal, sequence, data in rows:
             if data is not None:
@@ -307,7 +299,6 @@ class Outbox:
         self._first = to if self._first == epoch else self._first
 
     def _agent_of(self, robot: str) -> str:
-        """The agent of this file; a new file belongs to ``robot`` from now on."""
         with self._transaction() as connection:
             row = _one(connection, "SELECT name, agent FROM robot")
             if row is None:
@@ -323,7 +314,6 @@ class Outbox:
         return self.epoch
 
     def _epoch_of(self, connection: sqlite3.Connection, session: int) -> int:
-        """Epoch of a session of this start; a new one is stored."""
         row = _one(connection, "SELECT epoch FROM sessions WHERE session = ? AND epoch >= ?", session, self._first)
         if row is not None:
             return int(row[0])
@@ -349,7 +339,6 @@ class Outbox:
 
     @contextmanager
     def _state_errors(self) -> Iterator[None]:
-        """Raise errors of the database as an ``InputError`` of one line."""
         try:
             yield
         except StoreError as error:
@@ -365,7 +354,6 @@ def _digest(data: bytes) -> bytes:
 
 
 def _is_whole(data: bytes, session: int, ordinal: int, digest: bytes) -> bool:
-    """Whether a packet as it is sent is the one that the front end made."""
     try:
         return _digest(readdress(data, session, ordinal)) == digest
     except PacketError:

@@ -6,15 +6,13 @@ from dataclasses import dataclass, replace
 
 from fcslam.errors import FeatureError
 from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd, essential
-from fcslam.robot.backend_runner import BackendRunner
+from fcslam.robot.backend_runner import Submit
 from fcslam.robot.track import ScanTrack
 from fcslam.wire.messages import Body, Hello, Packet
 
 
 @dataclass(frozen=True, slots=True)
 class _Waiting:
-    """An input that the back end has not handled yet."""
-
     input: BackendInput
     output: "Future[list[Body]]"
     epoch: int
@@ -26,10 +24,10 @@ class _Waiting:
 class PacketQueue:
     """Gives inputs to the back end and numbers the packets; each session numbers its own from 0."""
 
-    def __init__(self, robot: str, backend: BackendRunner) -> None:
+    def __init__(self, robot: str, submit: Submit) -> None:
         self.failure: str | None = None
         """Why the back end ended early; from then on the robot sends neither closures nor places. None if it works."""
-        self._robot, self._backend = robot, backend
+        self._robot, self._submit = robot, submit
         self._waiting: deque[_Waiting] = deque()
         self._time = float("-inf")
         self._sequence = 0
@@ -53,7 +51,7 @@ class PacketQueue:
     def submit(self, input: BackendInput, epoch: int, track: ScanTrack) -> "Future[list[Body]]":
         """Give the back end its next input, of session ``epoch`` with the poses ``track``."""
         try:
-            output = self._backend.submit(input)
+            output = self._submit(input)
         except BrokenExecutor as error:
             # An input that came while the executor broke may be lost (Python 3.11): nothing else completes its future.
             for waiting in self._waiting:

@@ -195,6 +195,5 @@ class Sender:
         self._announced = announced or self._announced
 
     def _fetch(self, file: DetectorFile) -> None:
-        """Download a detector; without the file the robot keeps its present one."""
         with suppress(CloudError):
             self._keep(file, self._transport.detector(file.channel, file.version))

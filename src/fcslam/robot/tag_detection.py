@@ -94,7 +94,6 @@ class TagDetector:
 
 
 def _detected(detector: cv2.aruco.ArucoDetector, picture: GreyImage) -> list[tuple[int, FloatArray]]:
-    """Numbers of the tags and their corners, shape (4, 2), pixels."""
     quads, numbers, _ = detector.detectMarkers(picture)
     found = [] if numbers is None else numbers.ravel().tolist()
     return [(number, np.asarray(quad, np.float64).reshape(4, 2)) for number, quad in zip(found, quads, strict=True)]

@@ -146,7 +146,6 @@ class ViewExtractor:
         return CameraView(image.keyscan, keypoints, codes, detector.version)
 
     def _is_new(self, keyscan: int, T_odom_base: FloatArray) -> bool:
-        """Whether the robot moved enough since the last view; a keyscan has one view at most."""
         if self._last is None:
             return True
         seen_from, T_odom_last = self._last

@@ -21,7 +21,7 @@ from fcslam.learning.federated.robot_learning import (  # noqa: E402
 from fcslam.learning.federated.settings import RobotLearningSettings  # noqa: E402
 from fcslam.records import Channel, Place  # noqa: E402
 from fcslam.robot.backend import RobotBackend  # noqa: E402
-from fcslam.robot.backend_runner import InlineBackend  # noqa: E402
+from fcslam.robot.backend_runner import inline  # noqa: E402
 from fcslam.robot.frontend import RobotConfig, RobotFrontend  # noqa: E402
 from fcslam.robot.keyframe_folder import KeyframeFolder, read_keyframes  # noqa: E402
 from fcslam.wire.packets import decode, encode  # noqa: E402
@@ -38,7 +38,7 @@ def driven(tmp_path_factory):
     """The folder of a robot that drove to and fro, and its camera places as the cloud reads them."""
     folder = tmp_path_factory.mktemp("keyframes")
     config = RobotConfig(channels=(Channel.CAMERA,))
-    robot = RobotFrontend("r", config, InlineBackend(RobotBackend("r", config, folder)))
+    robot = RobotFrontend("r", config, inline(RobotBackend("r", config, folder)))
     records = records_of([(1.5, 1.5), (11.0, 1.5), (2.0, 1.5)], 1)[0]
     packets = [each for record in records for each in robot.process(record)] + robot.finish()
     bodies = [decode(encode(each)).body for each in packets]
