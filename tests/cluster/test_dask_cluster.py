@@ -17,7 +17,6 @@ from fcslam.cluster.dask_cluster import DaskCluster
 from fcslam.cluster.verifying import verifying
 from fcslam.errors import InputError
 from fcslam.geometry import se2
-from fcslam.lidar import pair_verification
 from fcslam.lidar.pair_verification import Pair, VerificationPool, verify_here
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
@@ -67,24 +66,19 @@ def warnings_of(caplog):
     return lambda: [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
 
 
-def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(
-    tmp_path, pairs, expected, warnings_of, caplog, monkeypatch
-):
-    monkeypatch.setattr(pair_verification, "PATIENCE_S", 0.3)
-    monkeypatch.setattr(pair_verification, "REST_S", 0.5)
+def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(tmp_path, pairs, expected, warnings_of, caplog):
     with Cluster(tmp_path) as cluster:
         one, two = cluster.start_worker("one"), cluster.start_worker("two")
         time.sleep(3.0)
         with DaskCluster(cluster.address) as workers:
-            verify = VerificationPool(workers.executors)
+            verify = VerificationPool(workers.executors, batch=2, patience_s=0.5, rest_s=0.5)
             wait_for(lambda: len(workers.executors()) == 2)
-            done = []
-            monkeypatch.setattr(
-                pair_verification,
-                "_read_aligned",
-                lambda *given, read=pair_verification._read_aligned: done.append(1) or read(*given),
-            )
-            wait_for(lambda: written(verify(pairs, CONFIG)) == expected and len(done) > 4)
+
+            def is_done_by_others(answers=1):
+                before = verify.answers
+                return written(verify(pairs, CONFIG)) == expected and verify.answers >= before + answers
+
+            wait_for(lambda: is_done_by_others(4))
 
             os.kill(one.pid, signal.SIGSTOP)  # it neither works nor ends
             assert written(verify(pairs, CONFIG)) == expected
@@ -94,8 +88,7 @@ def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(
             wait_for(lambda: len(workers.executors()) == 1)
             assert not warnings_of(), "a cluster may shrink"
 
-            done.clear()
-            wait_for(lambda: written(verify(pairs, CONFIG)) == expected and done)
+            wait_for(is_done_by_others)
             cluster.scheduler.kill()
             for _ in range(3):
                 assert written(verify(pairs, CONFIG)) == expected
@@ -109,8 +102,7 @@ def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(
             cluster.start_scheduler(int(cluster.address.rpartition(":")[2]))
             cluster.start_worker("three")
             wait_for(workers.executors)
-            done.clear()
-            wait_for(lambda: written(verify(pairs, CONFIG)) == expected and done)
+            wait_for(is_done_by_others)
             wait_for(lambda: "is back" in caplog.text)
         assert len(warnings_of()) == 1
 
@@ -208,8 +200,7 @@ def test_a_cluster_with_tls_takes_its_own_certificates_only(tmp_path, pairs, exp
             assert written(VerificationPool(workers.executors)(pairs, CONFIG)) == expected
 
 
-def test_the_command_maps_the_same_on_a_cluster_and_on_processes(tmp_path, logs, capsys, monkeypatch):
-    monkeypatch.setattr(pair_verification, "BATCH_S", 1e-9)
+def test_the_command_maps_the_same_on_a_cluster_and_on_processes(tmp_path, logs, capsys):
     arguments = ["map", *map(str, logs), "--quiet", "--output"]
     assert main([*arguments, str(tmp_path / "here")]) == 0
     assert main([*arguments, str(tmp_path / "processes"), "--workers", "2"]) == 0

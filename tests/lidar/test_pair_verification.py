@@ -15,11 +15,9 @@ import pytest
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
-from fcslam.lidar import pair_verification
-from fcslam.lidar.pair_verification import Pair, VerificationPool, verify_here
+from fcslam.lidar.pair_verification import AHEAD, Pair, VerificationPool, verify_here
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.submap_bytes import read_submap, submap_bytes
 from fcslam.lidar.verification import Gate, VerificationConfig
 from tests import small_fleet
 from tests.small_fleet import fingerprint, in_order
@@ -94,16 +92,13 @@ def pairs():
 
 
 @pytest.fixture
-def pool(monkeypatch):
-    """Makes pools with small batches, whose processes soon drop a submap."""
-    monkeypatch.setattr(pair_verification, "BATCH_S", 1e-9)
-    monkeypatch.setattr(pair_verification, "SUBMAPS_KEPT", 3)
-    monkeypatch.setattr(pair_verification, "NAMES_KEPT", 4)
+def pool():
+    """Makes pools with small batches."""
     with ExitStack() as stack:
 
         def make(workers):
             executors = [stack.enter_context(LastFirst()) for _ in range(workers)]
-            return VerificationPool(lambda: executors)
+            return VerificationPool(lambda: executors, batch=2)
 
         yield make
 
@@ -130,17 +125,7 @@ def test_a_pool_finds_what_is_found_here(pairs, workers, pool):
     assert len({check.strict for check in found}) == 2, "pairs of both kinds"
 
 
-def test_a_submap_read_from_its_bytes_is_the_same(pairs):
-    for submap in (pairs[0].a, pairs[-1].b):
-        data = submap_bytes(submap)
-        again = read_submap(data)
-        assert submap_bytes(again) == data
-        assert again.surface.points.flags.writeable
-        assert again.free.cells.flags.c_contiguous
-
-
-def test_a_submap_is_sent_once_however_often_it_is_built(pairs, monkeypatch):
-    monkeypatch.setattr(pair_verification, "BATCH_S", 1e-9)
+def test_a_submap_is_sent_once_however_often_it_is_built(pairs):
     sent = []
 
     def run(function, arguments):
@@ -150,7 +135,7 @@ def test_a_submap_is_sent_once_however_often_it_is_built(pairs, monkeypatch):
         return done
 
     executor = Failing(run)
-    verify = VerificationPool(lambda: [executor])
+    verify = VerificationPool(lambda: [executor], batch=2)
     for _ in range(3):
         rebuilt = [pair._replace(a=pickle.loads(pickle.dumps(pair.a))) for pair in pairs]
         verify(rebuilt, VerificationConfig())
@@ -184,18 +169,16 @@ def forgets(function, arguments):
 
 
 @pytest.mark.parametrize("fails", [gone, dies, is_cancelled, stays_away, forgets])
-def test_what_a_process_does_not_do_is_done_by_others(pairs, fails, pool, monkeypatch, caplog):
-    monkeypatch.setattr(pair_verification, "PATIENCE_S", 0.05)
-    monkeypatch.setattr(pair_verification, "PATIENCE_FACTOR", 0.0)
+def test_what_a_process_does_not_do_is_done_by_others(pairs, fails, caplog):
     failing, config = Failing(fails), VerificationConfig()
     expected = written(verify_here(pairs, config))
     with LastFirst() as works:
-        verify = VerificationPool(lambda: [failing, works])
+        verify = VerificationPool(lambda: [failing, works], batch=2, patience_s=0.05)
         for _ in range(3):
             assert written(verify(pairs, config)) == expected
     assert failing.asked
     if fails is not forgets:
-        assert failing.asked <= pair_verification.AHEAD + 1, "it rests, or still has what it was given"
+        assert failing.asked <= AHEAD + 1, "it rests, or still has what it was given"
     assert len([record for record in caplog.records if record.levelname == "WARNING"]) == (fails is gone)
 
 
@@ -213,16 +196,6 @@ def test_few_pairs_need_no_batch():
     assert not executor.asked
 
 
-@pytest.mark.parametrize(
-    ("count", "processes", "least", "lengths"),
-    [(0, 3, 5, [0]), (9, 3, 5, [9]), (10, 3, 5, [5, 5]), (39, 3, 5, [6, 7, 6, 7, 6, 7]), (1000, 2, 5, [125] * 8)],
-)
-def test_batches_are_long_enough_and_as_many_for_each_process(count, processes, least, lengths):
-    batches = pair_verification._split(count, processes, least)
-    assert [len(batch) for batch in batches] == lengths
-    assert [k for batch in batches for k in batch] == list(range(count))
-
-
 def test_a_fleet_with_a_pool_is_the_same(packets, pool):
     results = []
     for options in ({}, {"verify_pairs": pool(3)}):
@@ -234,12 +207,11 @@ def test_a_fleet_with_a_pool_is_the_same(packets, pool):
     assert results[0] == results[1]
 
 
-def test_processes_find_what_is_found_here(pairs, monkeypatch):
+def test_processes_find_what_is_found_here(pairs):
     """One of them is killed."""
-    monkeypatch.setattr(pair_verification, "BATCH_S", 1e-9)
     config = VerificationConfig()
     with ProcessPoolExecutor(1, get_context("spawn")) as one, ProcessPoolExecutor(1, get_context("spawn")) as two:
-        found = VerificationPool(lambda: [one, two])
+        found = VerificationPool(lambda: [one, two], batch=2)
         killed = one.submit(os.getpid).result()
         two.submit(os.getpid).result()
         for batch in (pairs, pairs[::-1], pairs[3:9], pairs):

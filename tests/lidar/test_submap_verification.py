@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Agreement, PackedSubmap, agreement, build_submap, self_violation
+from fcslam.lidar.submap import (
+    FREE_CELL_M,
+    SPACING_M,
+    Agreement,
+    agreement,
+    build_submap,
+    read_submap,
+    self_violation,
+    submap_bytes,
+)
 from fcslam.lidar.verification import (
     CLOSURE_SIGMA_M,
     CLOSURE_SIGMA_RAD,
@@ -176,7 +185,7 @@ def test_a_noisy_scanner_is_allowed_more_violation_and_no_scanner_much():
 def test_noise_is_measured_for_the_gate_that_decides(violation, predicted):
     """0.08 is too much for the strict gate without noise, 0.15 for the loose one."""
     free = Agreement(0.9, violation, 600, 0.9, 100.0 * np.eye(3))
-    aligned = Aligned(np.zeros(3), np.eye(3), free, 100.0, np.zeros(3))
+    aligned = Aligned(np.zeros(3), np.eye(3), free, np.zeros(3))
     asked = []
     noise = lambda: asked.append(1) or 0.2  # noqa: E731
     decided, other = (judge(aligned, CONFIG, noise, each) for each in (predicted, not predicted))
@@ -263,7 +272,9 @@ def test_information_of_the_inverse_pose(pose):
 
 def test_a_packed_submap_is_unpacked_as_it_was(same_room):
     (submap, _), (other, _) = same_room
-    unpacked = PackedSubmap.of(submap).unpack()
+    data = submap_bytes(submap)
+    unpacked = read_submap(data)
+    assert submap_bytes(unpacked) == data
     pairs = [
         *zip(submap.field.arrays, unpacked.field.arrays, strict=True),
         (submap.free.cells, unpacked.free.cells),

@@ -9,7 +9,7 @@ import numpy as np
 
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.scan import PointScan
-from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap, spaced
+from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray
 
@@ -35,11 +35,9 @@ class BuildingPlan:
         edges = replace(edges, points=edges.points + self.thickness_m * edges.normals)
         field = SurfelField(edges.points.mean(axis=0))
         field.insert(edges, _HERE)
-        surface = spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))
-        field.compact()
-        corner = surface.points.min(axis=0) - FREE_CELL_M
-        columns, rows = np.ceil((surface.points.max(axis=0) - corner) / FREE_CELL_M).astype(np.int64) + 1
-        return Submap(field, surface, FreeSpace(np.zeros((rows, columns), bool), corner))
+        corner = edges.points.min(axis=0) - FREE_CELL_M
+        columns, rows = np.ceil((edges.points.max(axis=0) - corner) / FREE_CELL_M).astype(np.int64) + 1
+        return Submap.of(field, FreeSpace(np.zeros((rows, columns), bool), corner))
 
 
 def _edges(drawing: OccupancyMap) -> PointScan:

@@ -7,7 +7,7 @@ from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
 from fcslam.lidar.scan import PointScan, keyscan_points
-from fcslam.lidar.submap import PackedSubmap, Submap, build_submap, self_violation
+from fcslam.lidar.submap import Submap, build_submap, read_submap, self_violation, submap_bytes
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
 
 UNPACKED: Final = 250
@@ -16,7 +16,7 @@ UNPACKED: Final = 250
 
 @dataclass(slots=True)
 class _Entry:
-    packed: PackedSubmap | None = None
+    packed: bytes | None = None
     noise: float | None = None
 
 
@@ -40,7 +40,7 @@ class SubmapCache:
         key = (place.id, place.channel)
         entry, submap = self._entry(key), self._unpacked.pop(key, None)
         if submap is None:
-            submap = entry.packed.unpack() if entry.packed is not None else build_submap(self._scans(place))
+            submap = read_submap(entry.packed) if entry.packed is not None else build_submap(self._scans(place))
             if len(self._unpacked) >= UNPACKED:
                 self._pack(next(iter(self._unpacked)))
         self._unpacked[key] = submap
@@ -67,11 +67,8 @@ class SubmapCache:
         return entry
 
     def _pack(self, key: _Key) -> None:
-        self._entries[key].packed = self._packed(key)
-        del self._unpacked[key]
-
-    def _packed(self, key: _Key) -> PackedSubmap:
-        return self._entries[key].packed or PackedSubmap.of(self._unpacked[key])
+        entry, submap = self._entries[key], self._unpacked.pop(key)
+        entry.packed = entry.packed or submap_bytes(submap)
 
     def _drop(self, key: _Key) -> None:
         self._entries.pop(key, None)

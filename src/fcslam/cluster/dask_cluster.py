@@ -21,8 +21,7 @@ import fcslam
 from fcslam.errors import InputError
 from fcslam.lidar.pair_verification import align_batch
 from fcslam.lidar.scan import point_scan
-from fcslam.lidar.submap import build_submap
-from fcslam.lidar.submap_bytes import submap_bytes
+from fcslam.lidar.submap import build_submap, submap_bytes
 from fcslam.records import LaserModel
 from fcslam.storage.state_file import code_version
 

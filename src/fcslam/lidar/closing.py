@@ -19,7 +19,7 @@ from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
 from fcslam.lidar.correlative import SearchWindow, search
-from fcslam.lidar.submap import PackedSubmap, Submap
+from fcslam.lidar.submap import Submap, read_submap, submap_bytes
 from fcslam.lidar.verification import VERIFICATION, Verification, verify
 from fcslam.records import FloatArray
 
@@ -142,9 +142,9 @@ class LoopCloser:
         """All submaps so far."""
         self._travel = np.empty(0)
         """Path length up to each of them, metres."""
-        self._held: dict[int, PackedSubmap] = {}
+        self._held: dict[int, bytes] = {}
         """The submaps that others are compared with, by index; the oldest of a well-known area are forgotten."""
-        self._submap = lru_cache(UNPACKED)(lambda index: self._held[index].unpack())
+        self._submap = lru_cache(UNPACKED)(lambda index: read_submap(self._held[index]))
         self._accepted: list[tuple[int, int]] = []
         """Earlier and later submap of each accepted closure."""
         self._pending: list[LocalClosure] = []
@@ -168,7 +168,7 @@ class LoopCloser:
         later = len(self.submaps)
         self.submaps.append(anchored)
         self._travel = np.append(self._travel, anchored.travel_m)
-        self._held[later] = PackedSubmap.of(submap)
+        self._held[later] = submap_bytes(submap)
         is_known = self._forget_surplus(anchors)
         paths = self._paths_from(later)
         candidates = self._candidates(later, anchors, paths)

@@ -10,7 +10,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from fcslam.errors import SourceError
 from fcslam.lidar.field import CELL_M, TABLE, TILE, TOO_MANY_WALLS, SurfelField
 from fcslam.lidar.scan import PointScan
-from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap, spaced
+from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray
 
@@ -46,9 +46,7 @@ def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
     field.insert(surface, np.zeros(3))
     if field.is_full:
         raise SourceError(f"{name}: {TOO_MANY_WALLS}")
-    surfels = spaced(PointScan(field.points, field.normals, field.solitary, np.zeros(2)))
-    field.compact()
-    return Submap(field, surfels, _free_space(occupancy))
+    return Submap.of(field, _free_space(occupancy))
 
 
 def _surface(occupancy: OccupancyMap) -> PointScan:

@@ -1,6 +1,5 @@
 """Verification of many pairs of submaps: here, or in batches on other processes. The results are the same."""
 
-import itertools
 import logging
 import math
 import threading
@@ -14,8 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fcslam.lidar.submap import Agreement, Submap
-from fcslam.lidar.submap_bytes import read_submap, submap_bytes
+from fcslam.lidar.submap import Agreement, Submap, read_submap, submap_bytes
 from fcslam.lidar.verification import (
     NO_PRIOR,
     Aligned,
@@ -27,28 +25,18 @@ from fcslam.lidar.verification import (
 )
 from fcslam.records import FloatArray
 
-BATCH_S: Final = 0.02
-"""Least work of a batch: handing one over takes a few milliseconds."""
-BATCHES_EACH: Final = 4
-"""Most batches of a process in one call, unless it is faster than others."""
+BATCH: Final = 20
+"""Pairs that are handed over together, about 20 ms of work: handing them over takes a few milliseconds."""
 AHEAD: Final = 2
 """Batches that a process has at a time: it begins the next one while the result of the last one travels."""
-PATIENCE_S: Final = 1.0
-PATIENCE_FACTOR: Final = 20.0
-"""A batch is repeated after this time and this many times its expected length."""
+PATIENCE_S: Final = 10.0
+"""A batch is repeated after this time."""
 REST_S: Final = 5.0
 """A process that failed gets no batch for so long."""
 SUBMAPS_KEPT: Final = 1000
 """Submaps that another process keeps, 0.2 MB each; the least recently used ones are dropped first."""
-NAMES_KEPT: Final = 200
+NAMES_KEPT: Final = SUBMAPS_KEPT // 5
 """Submaps whose hash is kept here."""
-_FIRST_GUESS_S: Final = 1e-3
-"""Length of a pair before one was measured."""
-_LENGTH_S: Final = (1e-4, 0.1)
-"""Limits of what is taken for the length of a pair: the first one may have waited for the compiler."""
-_SMOOTHING: Final = 0.1
-_ROW: Final = 14
-"""Numbers of a pair in a request: two submaps, guess, prior."""
 
 _log = logging.getLogger(__name__)
 
@@ -69,17 +57,30 @@ class Pair(NamedTuple):
 VerifyPairs = Callable[[Sequence[Pair], VerificationConfig], list[Verification]]
 """Verifies pairs and returns the results in their order."""
 
-Processes = Callable[[], Sequence[Executor]]
-"""The other processes that take batches now. Each executor runs its tasks in one process."""
-
 
 def verify_here(pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
     """Verify the pairs one after another in this process."""
-    return [_judge(align(pair.a, pair.b, pair.T_a_b_guess, pair.prior), pair, config) for pair in pairs]
+    return _judged(_aligned_here(pairs), pairs, config)
 
 
-def _judge(aligned: Aligned, pair: Pair, config: VerificationConfig) -> Verification:
-    return judge(aligned, config, pair.noise, pair.predicted)
+def _aligned_here(pairs: Sequence[Pair]) -> list[Aligned]:
+    return [align(pair.a, pair.b, pair.T_a_b_guess, pair.prior) for pair in pairs]
+
+
+def _judged(aligned: Sequence[Aligned], pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
+    return [judge(found, config, pair.noise, pair.predicted) for found, pair in zip(aligned, pairs, strict=True)]
+
+
+@dataclass(slots=True)
+class _Peer:
+    """Another process, and what it was sent."""
+
+    executor: Executor
+    sent: set[bytes] = field(default_factory=set)
+    """Hashes of the submaps that it was sent and may keep."""
+    pending: "list[Future[Answer]]" = field(default_factory=list)
+    rests_until: float = -math.inf
+    warned: bool = False
 
 
 class VerificationPool:
@@ -90,172 +91,110 @@ class VerificationPool:
     same, bit by bit, wherever a batch is aligned.
 
     A submap takes longer to send than to compare. Each process keeps those that it got, by a hash of their content.
+
+    Args:
+        processes: the other processes that take batches now, each of which runs its tasks one by one.
+        batch: pairs in a batch.
+        patience_s: time after which a batch is repeated.
+        rest_s: time for which a process that failed gets no batch.
     """
 
-    def __init__(self, processes: Processes) -> None:
-        """Start with no submap sent; the caller shuts the executors down."""
+    def __init__(
+        self,
+        processes: Callable[[], Sequence[Executor]],
+        batch: int = BATCH,
+        patience_s: float = PATIENCE_S,
+        rest_s: float = REST_S,
+    ) -> None:
+        self.answers = 0
+        """Batches that other processes have aligned so far."""
         self._processes = processes
+        self._batch, self._patience_s, self._rest_s = batch, patience_s, rest_s
         self._peers: dict[Executor, _Peer] = {}
         self._hashes: dict[int, tuple[bytes, Submap]] = {}
-        """By identity; the reference keeps the identity from being used again. Newest last."""
-        self._pair_s = _FIRST_GUESS_S
+        """By identity; the reference keeps the identity from being used again."""
 
     def __call__(self, pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
         """Results in the order of the pairs, whichever process is done first."""
-        if not pairs:
-            return []
-        peers = self._present()
-        batches = _split(len(pairs), 1 + len(peers), math.ceil(BATCH_S / self._pair_s))
-        aligned = self._align(pairs, batches, peers)
-        return [_judge(found, pair, config) for found, pair in zip(aligned, pairs, strict=True)]
-
-    def _present(self) -> "list[_Peer]":
-        executors, now = self._processes(), time.perf_counter()
-        self._peers = {executor: self._peers.get(executor) or _Peer(executor) for executor in executors}
-        return [peer for peer in self._peers.values() if peer.rests_until <= now]
-
-    def _align(self, pairs: Sequence[Pair], batches: Sequence[range], peers: "list[_Peer]") -> list[Aligned]:
-        call = _Call(pairs, deque(batches), {}, {})
-        while len(call.done) < len(batches):
-            self._hand_out(call, peers)
-            if call.todo:
-                batch = call.todo.pop()
-                began = time.perf_counter()
-                call.done[batch] = [align(p.a, p.b, p.T_a_b_guess, p.prior) for p in pairs[_slice(batch)]]
-                self._measured((time.perf_counter() - began) / len(batch))
+        self._peers = {executor: self._peers.get(executor) or _Peer(executor) for executor in self._processes()}
+        starts = range(0, len(pairs), self._batch)
+        batches = {start: pairs[start : start + self._batch] for start in starts}
+        todo = deque(starts)
+        running: dict[Future[Answer], tuple[_Peer, int, float]] = {}
+        done: dict[int, list[Aligned]] = {}
+        while len(done) < len(batches):
+            for peer in [*self._peers.values()] * AHEAD:
+                if len(todo) > 1 and self._has_room(peer):  # the last one is done here
+                    start = todo.popleft()
+                    try:
+                        future = self._submit(peer, batches[start])
+                    except RuntimeError as error:  # the executor is broken or shut down
+                        self._failed(peer, error)
+                        todo.append(start)
+                    else:
+                        running[future] = peer, start, time.perf_counter() + self._patience_s
+            if todo:
+                start = todo.pop()
+                done[start] = _aligned_here(batches[start])
             else:
-                wait(call.running, self._until_late_s(call), FIRST_COMPLETED)
-            self._collect(call)
-        return [found for batch in batches for found in call.done[batch]]
+                until_late_s = min(late_s for _, _, late_s in running.values()) - time.perf_counter()
+                wait(running, max(0.0, until_late_s), FIRST_COMPLETED)
+            for future, (peer, start, late_s) in list(running.items()):
+                if future.done() or time.perf_counter() >= late_s:
+                    del running[future]
+                    if (found := self._result(peer, future)) is None:
+                        todo.append(start)
+                    else:
+                        done[start] = found
+        return _judged([found for start in starts for found in done[start]], pairs, config)
 
-    def _hand_out(self, call: "_Call", peers: "list[_Peer]") -> None:
-        """Give batches to all processes that have room for them; the last one is done here."""
-        for _ in range(AHEAD):
-            for peer in peers:
-                if len(call.todo) <= 1 or peer.rests_until > time.perf_counter() or not peer.has_room():
-                    continue
-                batch = call.todo.popleft()
-                try:
-                    future = peer.submit(call.pairs[_slice(batch)], self._hash)
-                except RuntimeError as error:  # the executor is broken or shut down
-                    self._failed(peer, error)
-                    call.todo.append(batch)
-                else:
-                    late_s = time.perf_counter() + PATIENCE_S + PATIENCE_FACTOR * AHEAD * len(batch) * self._pair_s
-                    call.running[future] = _Running(peer, batch, late_s)
+    def _has_room(self, peer: _Peer) -> bool:
+        peer.pending = [future for future in peer.pending if not future.done()]
+        return peer.rests_until <= time.perf_counter() and len(peer.pending) < AHEAD
 
-    def _until_late_s(self, call: "_Call") -> float:
-        return max(0.0, min(running.late_s for running in call.running.values()) - time.perf_counter())
+    def _submit(self, peer: _Peer, pairs: Sequence[Pair]) -> "Future[Answer]":
+        submaps = {self._hash(submap): submap for pair in pairs for submap in (pair.a, pair.b)}
+        number = {name: k for k, name in enumerate(submaps)}
+        rows = [
+            (number[self._hash(pair.a)], number[self._hash(pair.b)], *pair.T_a_b_guess, *pair.prior.ravel())
+            for pair in pairs
+        ]
+        new = {name: submap_bytes(submap) for name, submap in submaps.items() if name not in peer.sent}
+        future = peer.executor.submit(align_batch, list(submaps), new, np.array(rows).tobytes())
+        peer.sent.update(submaps)
+        peer.pending.append(future)
+        return future
 
-    def _collect(self, call: "_Call") -> None:
-        for future, (peer, batch, late_s) in list(call.running.items()):
-            if not future.done() and time.perf_counter() < late_s:
-                continue
-            del call.running[future]
-            found = self._result(peer, future, len(batch))
-            if found is None:
-                call.todo.append(batch)
-            else:
-                call.done[batch] = found
-
-    def _result(self, peer: "_Peer", future: "Future[Answer]", count: int) -> list[Aligned] | None:
+    def _result(self, peer: _Peer, future: "Future[Answer]") -> list[Aligned] | None:
         """The answer of the process; None: another one must repeat the batch."""
-        if not future.done():
-            self._failed(peer, TimeoutError("no answer"))
-            return None
         try:
-            answer = future.result()
+            answer = future.result(0.0)
         except (Exception, CancelledError) as error:  # it is repeated here, where an error of the pairs is raised again
             self._failed(peer, error)
             return None
         if isinstance(answer, bytes):
-            return _read_aligned(answer, count)
-        peer.lost(answer)
+            self.answers += 1
+            return [_aligned(row) for row in np.frombuffer(answer).reshape(-1, _COLUMNS[-1]).copy()]
+        peer.sent.difference_update(answer)
         return None
 
-    def _failed(self, peer: "_Peer", error: BaseException) -> None:
-        local = isinstance(error, BrokenExecutor)
-        level = logging.WARNING if local and not peer.warned else logging.INFO
+    def _failed(self, peer: _Peer, error: BaseException) -> None:
+        level = logging.WARNING if isinstance(error, BrokenExecutor) and not peer.warned else logging.INFO
         _log.log(level, "another process verifies the closures of one that failed: %s: %s", type(error).__name__, error)
         peer.warned = True
         peer.sent.clear()
-        peer.rests_until = math.inf if local else time.perf_counter() + REST_S
-
-    def _measured(self, pair_s: float) -> None:
-        shortest, longest = _LENGTH_S
-        self._pair_s += _SMOOTHING * (min(max(pair_s, shortest), longest) - self._pair_s)
+        peer.rests_until = time.perf_counter() + self._rest_s
 
     def _hash(self, submap: Submap) -> bytes:
-        known = self._hashes.pop(id(submap), None)
-        if known is None:
-            known = blake2b(submap_bytes(submap), digest_size=16).digest(), submap
+        if id(submap) not in self._hashes:
             if len(self._hashes) >= NAMES_KEPT:
-                del self._hashes[next(iter(self._hashes))]
-        self._hashes[id(submap)] = known
-        return known[0]
-
-
-@dataclass(slots=True)
-class _Call:
-    """One call of a pool."""
-
-    pairs: Sequence[Pair]
-    todo: deque[range]
-    running: "dict[Future[Answer], _Running]"
-    done: dict[range, list[Aligned]]
-
-
-class _Running(NamedTuple):
-    peer: "_Peer"
-    batch: range
-    late_s: float
-    """When it is repeated, by the clock of the pool."""
-
-
-@dataclass(slots=True)
-class _Peer:
-    """Another process, and what it was sent."""
-
-    executor: Executor
-    sent: dict[bytes, None] = field(default_factory=dict)
-    """Hashes of the submaps that it keeps; newest last."""
-    pending: "list[Future[Answer]]" = field(default_factory=list)
-    rests_until: float = -math.inf
-    warned: bool = False
-
-    def has_room(self) -> bool:
-        """Whether it may have one more batch; one that does not answer gets none."""
-        self.pending = [future for future in self.pending if not future.done()]
-        return len(self.pending) < AHEAD
-
-    def submit(self, pairs: Sequence[Pair], hash_of: Callable[[Submap], bytes]) -> "Future[Answer]":
-        """Start to align a batch."""
-        submaps = {hash_of(submap): submap for pair in pairs for submap in (pair.a, pair.b)}
-        number = {name: k for k, name in enumerate(submaps)}
-        rows = np.array(
-            [
-                (number[hash_of(pair.a)], number[hash_of(pair.b)], *pair.T_a_b_guess, *pair.prior.ravel())
-                for pair in pairs
-            ]
-        )
-        new = {name: submap_bytes(submap) for name, submap in submaps.items() if name not in self.sent}
-        future = self.executor.submit(align_batch, list(submaps), new, rows.tobytes())
-        for name in submaps:
-            self.sent.pop(name, None)
-            self.sent[name] = None
-        while len(self.sent) > SUBMAPS_KEPT:
-            del self.sent[next(iter(self.sent))]
-        self.pending.append(future)
-        return future
-
-    def lost(self, names: Sequence[bytes]) -> None:
-        """It has these submaps no more."""
-        for name in names:
-            self.sent.pop(name, None)
+                self._hashes.clear()
+            self._hashes[id(submap)] = blake2b(submap_bytes(submap), digest_size=16).digest(), submap
+        return self._hashes[id(submap)][0]
 
 
 Answer = bytes | list[bytes]
-"""Alignments of a batch, as ``_aligned_bytes`` writes them; or the hashes of submaps that the process does not have."""
+"""Alignments of a batch, a row of ``_row`` each; or the hashes of submaps that the process does not have."""
 
 _kept: dict[bytes, Submap] = {}
 """Submaps of a process that takes batches, by the hash of their content. Newest last."""
@@ -277,62 +216,28 @@ def align_batch(names: Sequence[bytes], new: Mapping[bytes, bytes], rows: bytes)
         missing = [name for name in names if name not in _kept]
         if missing:
             return missing
-        submaps = []
-        for name in names:
-            submaps.append(_kept.pop(name))
-            _kept[name] = submaps[-1]
+        submaps = [_kept.pop(name) for name in names]
+        _kept.update(zip(names, submaps, strict=True))
         while len(_kept) > SUBMAPS_KEPT:
             del _kept[next(iter(_kept))]
-    return _aligned_bytes(
-        [
-            align(submaps[int(row[0])], submaps[int(row[1])], row[2:5].copy(), row[5:].reshape(3, 3).copy())
-            for row in np.frombuffer(rows).reshape(-1, _ROW)
-        ]
+    table = np.frombuffer(rows).reshape(-1, 14).copy()
+    pairs = [Pair(submaps[int(row[0])], submaps[int(row[1])], row[2:5], row[5:].reshape(3, 3)) for row in table]
+    return np.array([_row(found) for found in _aligned_here(pairs)]).tobytes()
+
+
+_COLUMNS: Final = (3, 12, 16, 25, 28)
+"""Ends of the columns of the parts of a row."""
+
+
+def _row(found: Aligned) -> FloatArray:
+    worse = found.worse
+    shares = worse.explained, worse.violation, worse.count, worse.overlap
+    return np.concatenate(
+        (found.T_a_b, found.information.ravel(), shares, worse.normal_tensor.ravel(), found.gap), dtype=np.float64
     )
 
 
-def _aligned_bytes(batch: Sequence[Aligned]) -> bytes:
-    """float64, shape (N, 29)."""
-    return np.array(
-        [
-            (
-                *found.T_a_b,
-                *found.information.ravel(),
-                found.worse.explained,
-                found.worse.violation,
-                found.worse.count,
-                found.worse.overlap,
-                *found.worse.normal_tensor.ravel(),
-                found.weakest,
-                *found.gap,
-            )
-            for found in batch
-        ]
-    ).tobytes()
-
-
-def _read_aligned(data: bytes, count: int) -> list[Aligned]:
-    return [
-        Aligned(
-            row[:3].copy(),
-            row[3:12].reshape(3, 3).copy(),
-            Agreement(float(row[12]), float(row[13]), int(row[14]), float(row[15]), row[16:25].reshape(3, 3).copy()),
-            float(row[25]),
-            row[26:29].copy(),
-        )
-        for row in np.frombuffer(data).reshape(count, -1)
-    ]
-
-
-def _split(count: int, processes: int, least: int) -> list[range]:
-    """Ranges of about equal length, of at least ``least`` pairs, as many for each process; one if that is too few."""
-    batches = min(count // least, BATCHES_EACH * processes)
-    if batches > processes:
-        batches -= batches % processes
-    batches = max(batches, 1)
-    ends = [count * k // batches for k in range(batches + 1)]
-    return [range(*span) for span in itertools.pairwise(ends)]
-
-
-def _slice(batch: range) -> slice:
-    return slice(batch.start, batch.stop)
+def _aligned(row: FloatArray) -> Aligned:
+    T_a_b, information, (explained, violation, count, overlap), tensor, gap, _ = np.split(row, _COLUMNS)
+    worse = Agreement(float(explained), float(violation), int(count), float(overlap), tensor.reshape(3, 3))
+    return Aligned(T_a_b, information.reshape(3, 3), worse, gap)

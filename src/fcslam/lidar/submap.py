@@ -1,10 +1,11 @@
 """Submaps: surfaces and free space seen by the keyscans around one anchor keyscan, in the base of the anchor."""
 
+import json
 import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +53,16 @@ class Submap:
     surface: PointScan
     """Surfels about 0.1 m apart, without moving ones (people), which beams of other scans passed through."""
     free: FreeSpace
-    rows: NDArray[np.int16] | None = None
-    """Row of each point of ``surface`` among the surfels of ``field``, shape (N,); None: they are not among them."""
+    rows: NDArray[np.int16]
+    """Row of each point of ``surface`` among the surfels of ``field``, shape (N,)."""
+
+    @classmethod
+    def of(cls, field: SurfelField, free: FreeSpace, rows: NDArray[np.int64] | None = None) -> Self:
+        """The submap of a field, which takes no more scans, with the surfels ``rows``; None: all, spaced."""
+        rows = _spaced_rows(field.points) if rows is None else rows
+        surface = PointScan(field.points, field.normals, field.solitary, np.zeros(2)).only(rows)
+        field.compact()
+        return cls(field, surface, free, rows.astype(np.int16))
 
 
 def build_submap(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float = RADIUS_M) -> Submap:
@@ -74,10 +83,7 @@ def build_submap(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float 
     column, row = np.floor((points - corner) / FREE_CELL_M).astype(np.int64).T
     passed, hit = passes[row, column], hits[row, column]
     moved = (passed >= SEEN_THROUGH) & (passed > SEEN_THROUGH_RATIO * hit)
-    rows = rows[~moved]
-    surface = PointScan(field.points, field.normals, field.solitary, np.zeros(2)).only(rows)
-    field.compact()
-    return Submap(field, surface, FreeSpace(passes > 0, corner), rows.astype(np.int16))
+    return Submap.of(field, FreeSpace(passes > 0, corner), rows[~moved])
 
 
 def _near(scan: PointScan, T_anchor_base: FloatArray, radius_m: float) -> PointScan:
@@ -136,11 +142,6 @@ def _count_beams(points, origin, T, corner, number, latest, passes, hits):  # ty
                 latest[0, y, x] = number
 
 
-def spaced(surfels: PointScan) -> PointScan:
-    """The first surfel of each cell of ``SPACING_M``."""
-    return surfels.only(_spaced_rows(surfels.points))
-
-
 def _spaced_rows(points: FloatArray) -> NDArray[np.int64]:
     """Number of the first of the points (N, 2) in each cell of ``SPACING_M``, ascending, shape (K,)."""
     cells = np.floor(points / SPACING_M).astype(np.int64)
@@ -148,54 +149,47 @@ def _spaced_rows(points: FloatArray) -> NDArray[np.int64]:
     return np.sort(first)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PackedSubmap:
-    """A submap in a third of the memory, without loss: its cells are compressed, its surface refers to the surfels."""
+def submap_bytes(submap: Submap) -> bytes:
+    """A submap in a third of the memory, without loss: its cells are compressed, its surface refers to the surfels.
 
-    field: FieldArrays
-    """The arrays of the submap's field, without its labels."""
-    labels: bytes
-    """The labels of the field, compressed."""
-    rows: NDArray[np.int16]
-    solitary: NDArray[np.bool_]
-    origin: FloatArray
-    """Origin of the surface."""
-    free: bytes
-    """The free cells as bits, compressed."""
-    free_shape: tuple[int, int]
-    corner: FloatArray
-    """Corner of the free cells."""
-
-    @classmethod
-    def of(cls, submap: Submap) -> Self:
-        """Pack a submap of ``build_submap``."""
-        assert submap.rows is not None, "its surface consists of surfels"
-        field, (rows, columns) = submap.field.arrays, submap.free.cells.shape
-        return cls(
-            field=field._replace(labels=_NO_LABELS),
-            labels=zlib.compress(field.labels.tobytes(), _PACKING),
-            rows=submap.rows,
-            solitary=submap.surface.solitary,
-            origin=submap.surface.origin,
-            free=zlib.compress(np.packbits(submap.free.cells).tobytes(), _PACKING),
-            free_shape=(rows, columns),
-            corner=submap.free.corner,
-        )
-
-    def unpack(self) -> Submap:
-        """The submap as it was."""
-        # Copies: compiled code would be compiled once more for arrays that cannot be written.
-        labels = np.frombuffer(zlib.decompress(self.labels), np.int16).reshape(-1, TILE, TILE).copy()
-        bits = np.frombuffer(zlib.decompress(self.free), np.uint8)
-        cells = np.unpackbits(bits, count=math.prod(self.free_shape)).view(np.bool_).reshape(self.free_shape)
-        field = SurfelField.of(self.field._replace(labels=labels))
-        surface = PointScan(field.points[self.rows], field.normals[self.rows], self.solitary, self.origin)
-        return Submap(field, surface, FreeSpace(cells, self.corner), self.rows)
+    The same bytes for the same submap, on every machine with this byte order. Nothing in them is executed.
+    """
+    field, free = submap.field.arrays, submap.free
+    arrays = (
+        field.corner,
+        field.table,
+        _compressed(field.labels),
+        field.surfels,
+        field.used,
+        submap.rows,
+        submap.surface.solitary,
+        _compressed(np.packbits(free.cells)),
+        np.array(free.cells.shape),
+        free.corner,
+    )
+    header = json.dumps([(array.dtype.str, array.shape) for array in arrays]).encode()
+    return b"".join((header, b"\n", *(array.tobytes() for array in arrays)))
 
 
-_PACKING: Final = 1
-"""Level of zlib: more takes twice as long for a tenth less."""
-_NO_LABELS: Final = np.zeros((0, TILE, TILE), np.int16)
+def read_submap(data: bytes) -> Submap:
+    """The submap of ``submap_bytes``. Its arrays are copies: compiled code would be compiled once more for others."""
+    begin = data.index(b"\n") + 1
+    arrays: list[NDArray[Any]] = []
+    for kind, shape in json.loads(data[:begin]):
+        arrays.append(np.frombuffer(data, np.dtype(kind), math.prod(shape), begin).reshape(shape).copy())
+        begin += arrays[-1].nbytes
+    corner, table, packed, surfels, used, rows, solitary, free, free_shape, free_corner = arrays
+    labels = np.frombuffer(zlib.decompress(packed.tobytes()), np.int16).reshape(-1, TILE, TILE).copy()
+    field = SurfelField.of(FieldArrays(corner, table, labels, surfels, used))
+    bits = np.frombuffer(zlib.decompress(free.tobytes()), np.uint8)
+    cells = np.unpackbits(bits, count=math.prod(free_shape)).view(np.bool_).reshape(free_shape)
+    surface = PointScan(field.points[rows], field.normals[rows], solitary, np.zeros(2))
+    return Submap(field, surface, FreeSpace(cells, free_corner), rows)
+
+
+def _compressed(array: NDArray[Any]) -> NDArray[np.uint8]:
+    """At the lowest level of zlib: more takes twice as long for a tenth less."""
+    return np.frombuffer(zlib.compress(array.tobytes(), 1), np.uint8)
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,8 +96,6 @@ class Aligned(NamedTuple):
     T_a_b: FloatArray
     information: FloatArray
     worse: Agreement
-    weakest: float
-    """Smallest eigenvalue of the normal tensor of ``worse``."""
     gap: FloatArray
     """Motion between both alignments, shape (3,), metres and radians."""
 
@@ -156,7 +154,7 @@ def align(a: Submap, b: Submap, T_a_b_guess: FloatArray, prior: FloatArray = NO_
         worse.normal_tensor,
     )
     information = limited_information(forward.information + prior, float(T_a_b[2]), UNFIXED, LEAST_VARIANCE)
-    return Aligned(T_a_b, information, worse, worse.weakest, gap)
+    return Aligned(T_a_b, information, worse, gap)
 
 
 def judge(
@@ -172,7 +170,7 @@ def judge(
         predicted: whether an estimate predicts the closure. The loose gate decides then, otherwise the strict one. The
             noise counts for the gate that decides: to measure it takes as long as to build two submaps.
     """
-    worse, weakest = aligned.worse, aligned.weakest
+    worse, weakest = aligned.worse, aligned.worse.weakest
     asymmetric = _asymmetry(aligned.gap)
     symmetric = asymmetric is None
     if asymmetric is not None:
