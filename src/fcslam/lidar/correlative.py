@@ -21,11 +21,7 @@ MAXIMUM_REACH_M = 25.0
 REACH_QUANTILE = 0.9
 """The angle step moves a point at this quantile of the distances by one cell."""
 CELL_M = 0.1
-"""Side of a cell of the likelihood grid, metres."""
-SMEAR_M = 0.1
-"""Standard deviation of the likelihood around a surface, metres."""
-SMEARED_CELLS: Final = math.ceil(2.5 * SMEAR_M / CELL_M)
-"""Cells on each side of a surfel's own that are drawn."""
+"""Side of a cell of the likelihood grid, and standard deviation of the likelihood around a surface, metres."""
 MOST_LEVELS = 6
 """Most levels of the pyramid; a step on the coarsest one of them is 2^5 cells."""
 MOST_POINTS = 120
@@ -44,6 +40,10 @@ class SearchWindow:
     """Share of the score lost at its edge, as in Karto."""
     angle_penalty: float = 0.0
     """Share of the score lost at the largest turn, as in Karto."""
+    cell_m: float = CELL_M
+    """Side of a cell of the likelihood grid, metres."""
+    smear_m: float = CELL_M
+    """Standard deviation of the likelihood around a surface, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,9 @@ def likelihood_pyramid(
     T_field_guess: FloatArray,
     half_side_m: float,
     visible_only: bool = False,
-    levels: int | None = None,
+    levels: int = MOST_LEVELS,
+    cell_m: float = CELL_M,
+    smear_m: float = CELL_M,
 ) -> LikelihoodPyramid:
     """Draw the surfaces around the guess and build the pyramid.
 
@@ -81,17 +83,16 @@ def likelihood_pyramid(
         T_field_guess: centre of the grid, shape (3,), metres and radians in the field's coordinates.
         half_side_m: half side of the grid, metres.
         visible_only: draw only surfaces that face the guess (Karto's visibility filter), for one scan near the guess.
-        levels: number of levels, if fewer than ``MOST_LEVELS`` are of use.
-
-    Returns:
-        The pyramid, shape (levels, H, W).
+        levels: number of levels.
+        cell_m, smear_m: as in ``SearchWindow``.
     """
-    size = math.ceil(2.0 * half_side_m / CELL_M) + 1
+    size = math.ceil(2.0 * half_side_m / cell_m) + 1
     corner = np.asarray(T_field_guess[:2]) - half_side_m
     surfels, count = field.arrays.surfels, int(field.arrays.used[1])
     viewpoint = np.array(T_field_guess[:2]) if visible_only else np.full(2, np.nan)
-    base = _draw(surfels, count, viewpoint, corner, size)
-    return LikelihoodPyramid(_pyramid(base, MOST_LEVELS if levels is None else levels), corner, CELL_M)
+    smeared = math.ceil(2.5 * smear_m / cell_m)
+    base = _draw(surfels, count, viewpoint, corner, size, cell_m, smear_m, smeared)
+    return LikelihoodPyramid(_pyramid(base, levels), corner, cell_m)
 
 
 def search(
@@ -116,12 +117,13 @@ def search(
         The best pose; ``better_than`` if none exceeds its score; the guess itself, with score 0, if no pose of the
         window puts a point on a surface.
     """
-    thinned = scan.thinned(CELL_M, MOST_POINTS)
+    cell_m = window.cell_m
+    thinned = scan.thinned(cell_m, MOST_POINTS)
     reach = float(np.max(np.hypot(*thinned.points.T), initial=1.0))
-    half_side = min(reach, MAXIMUM_REACH_M) + window.radius_m + CELL_M
-    usable = int(np.log2(window.radius_m / CELL_M + 1.0)) + 1  # the levels that the window can use
+    half_side = min(reach, MAXIMUM_REACH_M) + window.radius_m + cell_m
+    usable = int(np.log2(window.radius_m / cell_m + 1.0)) + 1  # the levels that the window can use
     levels = min(MOST_LEVELS, max(1, usable))
-    pyramid = likelihood_pyramid(field, T_field_guess, half_side, visible_only, levels)
+    pyramid = likelihood_pyramid(field, T_field_guess, half_side, visible_only, levels, cell_m, window.smear_m)
     return search_pyramid(thinned, pyramid, T_field_guess, window, better_than)
 
 
@@ -165,24 +167,24 @@ def _quantile(values: FloatArray, share: float) -> float:
 
 
 @njit
-def _draw(surfels, count, viewpoint, corner, size):  # type: ignore[no-untyped-def]
-    """Likelihood of the surfels that face the viewpoint, or of all if it is NaN."""
-    half, margin = SMEARED_CELLS, 2 * SMEARED_CELLS
+def _draw(surfels, count, viewpoint, corner, size, cell_m, smear_m, half):  # type: ignore[no-untyped-def]
+    """Likelihood of the surfels that face the viewpoint, or of all if it is NaN; ``half`` a width in cells is drawn."""
+    margin = 2 * half
     grid = np.zeros((size + 2 * margin, size + 2 * margin), np.uint8)  # with a margin on each side: no cell is outside
     across = np.empty(2 * half + 1)
     for i in range(count):
         x, y = surfels[i, 0], surfels[i, 1]
         if surfels[i, 2] * (viewpoint[0] - x) + surfels[i, 3] * (viewpoint[1] - y) < 0.0:
             continue
-        cx, cy = int(np.floor((x - corner[0]) / CELL_M)), int(np.floor((y - corner[1]) / CELL_M))
+        cx, cy = int(np.floor((x - corner[0]) / cell_m)), int(np.floor((y - corner[1]) / cell_m))
         if cx < -half or cy < -half or cx >= size + half or cy >= size + half:
             continue
         for k in range(2 * half + 1):
-            dx = corner[0] + (cx - half + k + 0.5) * CELL_M - x
-            across[k] = 255.0 * np.exp(-0.5 * dx * dx / (SMEAR_M * SMEAR_M))
+            dx = corner[0] + (cx - half + k + 0.5) * cell_m - x
+            across[k] = 255.0 * np.exp(-0.5 * dx * dx / (smear_m * smear_m))
         for j in range(2 * half + 1):
-            dy = corner[1] + (cy - half + j + 0.5) * CELL_M - y
-            factor = np.exp(-0.5 * dy * dy / (SMEAR_M * SMEAR_M))
+            dy = corner[1] + (cy - half + j + 0.5) * cell_m - y
+            factor = np.exp(-0.5 * dy * dy / (smear_m * smear_m))
             row = grid[cy - half + j + margin]
             for k in range(2 * half + 1):
                 cell = cx - half + k + margin

@@ -44,7 +44,7 @@ CLUTTER_SCALE_M = 0.15
 points than before."""
 UNSURE_SUPPORTED = 0.2
 """``SUPPORTED`` after such a step: odometry alone errs by more than a match of which less is known."""
-_NO_INFORMATION = np.zeros((3, 3))
+NO_INFORMATION = np.zeros((3, 3))
 _DIRECTIONS = np.array([(0.0, 0.0, 0.0), *product((-1.0, 1.0), repeat=3)])
 
 
@@ -142,13 +142,13 @@ class ScanTracker:
         is_still = self._odometry.is_measured and moved_m < STILL_M and turned_rad < STILL_RAD
         matched_here = (self._matched_here if is_still else frozenset()) | {scan.laser.T_base_laser}
         if self._fields and is_still and matched_here == self._matched_here:
-            tracked = TrackedScan(T_local_guess, _NO_INFORMATION, None, scan.sweep)
+            tracked = TrackedScan(T_local_guess, NO_INFORMATION, None, scan.sweep)
             unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
         # 2. Scan to points.
         points = point_scan(scan.matched_ranges_m, scan.laser, scan.sweep)
         if not self._fields:
-            tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
+            tracked = TrackedScan(T_local_guess, NO_INFORMATION, points, scan.sweep)
             unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
         # 3. Scan matching; a doubtful match starts a correlative search, also where the robot was if odometry may have
@@ -171,7 +171,7 @@ class ScanTracker:
             )
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
         if match.explained < (UNSURE_SUPPORTED if self._is_unsure(error) else SUPPORTED):
-            tracked = TrackedScan(T_local_guess, _NO_INFORMATION, points, scan.sweep)
+            tracked = TrackedScan(T_local_guess, NO_INFORMATION, points, scan.sweep)
             rejected = match.explained, match.known, scan.T_odom_base, moved_m, turned_rad
             return TrackingResult(tracked, *rejected, self._matched_here, self._trust, self._usual)
         tracked = TrackedScan(match.T_field_base, match.information, points, _corrected(scan.sweep, match.velocity))
@@ -278,7 +278,7 @@ class ScanTracker:
         found = search(points, field, T_local_guess, window, visible_only=True, better_than=match.T_field_base)
         if np.array_equal(found.T_field_base, match.T_field_base):
             return match
-        other = match_scan(thinned, field, found.T_field_base, _NO_INFORMATION, velocity)
+        other = match_scan(thinned, field, found.T_field_base, NO_INFORMATION, velocity)
         other_innovation = se2.motion(T_local_guess, other.T_field_base)
         is_fixed = is_doubtful or weakest_sigma_m(other.information) < SEARCH_SIGMA_M
         if is_fixed and other.log_likelihood + learned.log_likelihood(other_innovation) > log_posterior + SEARCH_GAIN:
@@ -292,7 +292,7 @@ def _likeliest(
     """The likeliest match of several starts: the guess, and one standard deviation from it in every direction."""
     deviations = _DIRECTIONS * (learned.position_m, learned.position_m, learned.heading_rad)
     matches = (
-        match_scan(scan, field, start, _NO_INFORMATION, velocity, clutter_scale_m=CLUTTER_SCALE_M)
+        match_scan(scan, field, start, NO_INFORMATION, velocity, clutter_scale_m=CLUTTER_SCALE_M)
         for start in se2.compose(T_local_guess, deviations)
     )
     return max(
