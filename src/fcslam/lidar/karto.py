@@ -91,7 +91,7 @@ class KartoTracker(ScanTracker):
 
 
 def match_covariance(scan: PointScan, field: SurfelField, T_field_base: FloatArray) -> FloatArray:
-    """Covariance of a match over (x, y) in the field and theta, shape (3, 3): second moments of the likelihoods near it.
+    """Covariance of a match over (x, y) in the field and theta, shape (3, 3): moments of the likelihoods near it.
 
     Args:
         scan: points in ``base``.
