@@ -47,9 +47,8 @@ from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_f
 from fcslam.mission.mission_store import MissionStore
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.service.intake import Intake
-from fcslam.service.shared.mission_tables import MissionTables
+from fcslam.service.shared.mission_tables import MissionTables, prepare
 from fcslam.service.shared.registry import Registry
-from fcslam.service.shared.schema import prepare
 from fcslam.sources import open_source, write_bag
 from fcslam.storage.postgres import Postgres, take_password
 from fcslam.wire.batches import MEDIA_TYPE, write_batch

@@ -100,7 +100,7 @@ def postgres_server(tmp_path_factory):
 @pytest.fixture
 def postgres(postgres_server):
     """A connection to a PostgreSQL server with the tables of this version and, perhaps, missions of other tests."""
-    from fcslam.service.shared.schema import prepare
+    from fcslam.service.shared.mission_tables import prepare
     from fcslam.storage.postgres import Postgres, take_password
 
     with pytest.MonkeyPatch.context() as patch:

@@ -50,8 +50,7 @@ def serve(
         typer.Option(
             metavar="URL",
             help="PostgreSQL database for all missions, postgresql://USER@HOST:PORT/DATABASE; several instances may "
-            "share it (FCSLAM_MAX_MISSIONS and FCSLAM_MAX_ROBOTS limit this one). The default is a file for "
-            "each mission in --data.",
+            "share it (FCSLAM_MAX_MISSIONS limits this one). The default is a file for each mission in --data.",
             rich_help_panel="Several instances",
         ),
     ] = None,

@@ -8,6 +8,7 @@ import ssl
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
@@ -22,27 +23,19 @@ from fcslam.errors import FcslamError, InputError
 from fcslam.learning.federated.settings import RELEASE, FleetLearningSettings
 from fcslam.learning.settings import DETECTOR
 from fcslam.processes import Child, module_command
-from fcslam.service.audit_log import AuditFile
+from fcslam.service.audit_log import audit_file, audit_table
 from fcslam.service.http.authentication import Authenticator, read_tokens
 from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
 from fcslam.service.http.state import EventStream, ServiceState
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import Missions
-from fcslam.service.shared.audit_table import AuditTable
-from fcslam.service.shared.instance import Hooks
-from fcslam.service.shared.mission_tables import Lease
+from fcslam.service.shared.mission_tables import Lease, prepare
 from fcslam.service.shared.missions import SharedMissions
 from fcslam.service.shared.registry import KnownMission
-from fcslam.service.shared.schema import prepare
 from fcslam.service.supervisor import RunningWorker, StandbyWorkers, Supervisor, WorkerTask, start_worker
 from fcslam.storage.postgres import Postgres, is_server, take_password
 from fcslam.wire.http_transport import is_loopback
-
-MAX_MISSIONS, MAX_ROBOTS = 20, 200
-"""Workers that an instance runs, and robots that may send to it, unless the environment says more."""
-LONGEST_HOST = 58
-"""Characters of the host in an instance's name, which has 64 at most."""
 
 _log = logging.getLogger("fcslam.service")
 
@@ -68,7 +61,7 @@ def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, wor
 
     missions = Missions(data, config, time.monotonic, time.time, launch)
     return ServiceState(
-        missions, authenticator, RateLimit(time.monotonic), events, AuditFile(data / "audit.jsonl"), data / "learning"
+        missions, authenticator, RateLimit(time.monotonic), events, audit_file(data / "audit.jsonl"), data / "learning"
     )
 
 
@@ -77,11 +70,11 @@ def shared_state(
 ) -> ServiceState:
     """The state of an instance of the store; who closes its missions closes all that it holds.
 
-    Host and port name the instance; FCSLAM_MAX_MISSIONS and FCSLAM_MAX_ROBOTS limit it.
+    Host and port name the instance; FCSLAM_MAX_MISSIONS limits it.
     """
-    name = f"{socket.gethostname()[:LONGEST_HOST]}-{port}"
-    missions_here = _limit("FCSLAM_MAX_MISSIONS", 0, MAX_MISSIONS)
-    robots_here = _limit("FCSLAM_MAX_ROBOTS", 1, MAX_ROBOTS)
+    name, limit = f"{socket.gethostname()[:58]}-{port}", os.environ.get("FCSLAM_MAX_MISSIONS") or "20"
+    if not limit.isdecimal():
+        raise InputError(f"FCSLAM_MAX_MISSIONS={limit}: is not a number from 0 on")
     if not is_server(store):
         raise InputError("--store: not the address of a database; write postgresql://USER@HOST:PORT/DATABASE")
     url = take_password(store)
@@ -89,7 +82,7 @@ def shared_state(
         server = opened.enter_context(closing(Postgres(url, name)))
         prepare(server)
         standby = opened.enter_context(closing(StandbyWorkers()))
-        audit = opened.enter_context(closing(AuditTable(server, name)))
+        audit = audit_table(server, name, opened.enter_context(ThreadPoolExecutor(1, "audit log")))
 
         def launch(mission: KnownMission, lease: Lease) -> RunningWorker:
             folder = MissionFolder(data / "missions" / mission.name)
@@ -100,17 +93,9 @@ def shared_state(
 
         missions: SharedMissions
         events = EventStream(lambda: missions.open_mission.name)
-        hooks = Hooks(launch, events.publish, lambda: os.kill(os.getpid(), signal.SIGTERM))
-        missions = SharedMissions(data, config, server, name, missions_here, robots_here, hooks)
+        missions = SharedMissions(data, config, server, name, int(limit), launch, events.publish)
         missions.closing = opened.pop_all().close
         return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit)
-
-
-def _limit(variable: str, least: int, otherwise: int) -> int:
-    text = os.environ.get(variable) or str(otherwise)
-    if not (text.isdecimal() and int(text) >= least):
-        raise InputError(f"{variable}={text}: is not a number from {least} on")
-    return int(text)
 
 
 def reload_on_hangup(state: ServiceState, tokens: Path | None) -> None:

@@ -5,17 +5,19 @@ import logging
 import math
 import os
 import time
-from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from fcslam.errors import StoreError
+from fcslam.storage.postgres import Postgres
+
 REFUSED_EVERY_S = 60.0
 """Refused logins make one line in this time at most, so no client without a token can fill the disk."""
-_READ_BYTES = 2**20
-"""Bytes at the end of the log that ``newest`` reads."""
 
 _log = logging.getLogger(__name__)
 
@@ -38,22 +40,17 @@ class AuditEntry:
     """The content of the request, without secrets."""
 
 
-class AuditLog(ABC):
+class AuditLog:
     """Lines that only the service appends."""
 
-    def __init__(self, wall_clock: Callable[[], float]) -> None:
-        self._wall_clock = wall_clock
+    def __init__(
+        self, append: Callable[[bytes], object], lines: Callable[[int], list[bytes]], wall_clock: Callable[[], float]
+    ) -> None:
+        """``append`` appends a line; ``lines`` gives at most so many newest ones, the oldest of them first."""
+        self._append, self._lines, self._wall_clock = append, lines, wall_clock
         self._refused, self._refused_from = 0, ""
         """Refused logins that have no line yet, and where the last one came from."""
         self._line_at = -math.inf
-
-    @abstractmethod
-    def append(self, line: bytes) -> None:
-        """Append a line."""
-
-    @abstractmethod
-    def lines(self, limit: int) -> list[bytes]:
-        """At most ``limit`` newest lines, the oldest of them first."""
 
     def record(self, who: str, address: str, action: str, status: int, content: Mapping[str, Any]) -> None:
         """Append what somebody did. A disk that is full loses the line, which the service's own log then says."""
@@ -61,9 +58,9 @@ class AuditLog(ABC):
         entry = AuditEntry(at, who, address, action, status, content)
         line = json.dumps(asdict(entry), separators=(",", ":")).encode()
         try:
-            self.append(line)
+            self._append(line)
         except OSError as error:
-            _log.error("%s: cannot be written (%s); lost: %s", self, error, line.decode())
+            _log.error("the audit log cannot be written (%s); lost: %s", error, line.decode())
 
     def refuse_login(self, address: str) -> None:
         """Count a request that no known token or certificate came with."""
@@ -78,34 +75,44 @@ class AuditLog(ABC):
             self._refused, self._line_at = 0, self._wall_clock() + REFUSED_EVERY_S
 
     def newest(self, limit: int) -> list[AuditEntry]:
-        """The entries of ``lines``."""
-        return [AuditEntry(**json.loads(line)) for line in self.lines(limit)]
+        """At most so many newest entries, the oldest of them first."""
+        return [AuditEntry(**json.loads(line)) for line in self._lines(limit)]
 
 
-class AuditFile(AuditLog):
-    """A file that is written in one thread and may be read in any."""
+def audit_file(path: Path, wall_clock: Callable[[], float] = time.time) -> AuditLog:
+    """A log in a file that is written in one thread and may be read in any."""
 
-    def __init__(self, path: Path, wall_clock: Callable[[], float] = time.time) -> None:
-        super().__init__(wall_clock)
-        self._path = path
-
-    def __str__(self) -> str:
-        return str(self._path)
-
-    def append(self, line: bytes) -> None:
-        """As in ``AuditLog``."""
-        file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+    def append(line: bytes) -> None:
+        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
         try:
             os.write(file, line + b"\n")
         finally:
             os.close(file)
 
-    def lines(self, limit: int) -> list[bytes]:
-        """As in ``AuditLog``."""
+    def lines(limit: int) -> list[bytes]:
         try:
-            with self._path.open("rb") as file:
-                start = max(0, file.seek(0, os.SEEK_END) - _READ_BYTES)
-                file.seek(start)
-                return file.read().splitlines()[1 if start else 0 :][-limit:]
+            with path.open("rb") as file:
+                return list(deque(file, limit))
         except FileNotFoundError:
             return []
+
+    return AuditLog(append, lines, wall_clock)
+
+
+def audit_table(server: Postgres, instance: str, writer: Executor) -> AuditLog:
+    """A log in a table that all instances append to; the ``writer`` writes, so no request waits for the store."""
+
+    def append(line: bytes) -> None:
+        writer.submit(write, line.decode())
+
+    def write(line: str) -> None:
+        try:
+            server.rows("INSERT INTO audit (instance, entry) VALUES (?, ?) RETURNING 1", (instance, line))
+        except StoreError as error:
+            _log.error("%s; lost: %s", error, line)
+
+    def lines(limit: int) -> list[bytes]:
+        rows = server.rows("SELECT entry FROM audit ORDER BY number DESC LIMIT ?", (limit,))
+        return [entry.encode() for (entry,) in reversed(rows)]
+
+    return AuditLog(append, lines, time.time)

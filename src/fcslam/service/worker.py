@@ -23,6 +23,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import blake2b
 from importlib import import_module
 from pathlib import Path
@@ -47,7 +48,7 @@ from fcslam.runs import QUALITY, Metric, Run
 from fcslam.service.crash_log import MOST_CRASHES, CrashLog
 from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.shared.files import JOINT, LIVE, RESULT, SNAPSHOT, SharedFiles
+from fcslam.service.shared.files import JOINT, LIVE, RESULT, SNAPSHOT, fetch_snapshot, put_file
 from fcslam.service.shared.mission_tables import Lease, LeaseLostError, MissionTables
 from fcslam.service.supervisor import PROGRESS, READY, STAGES, WorkerTask
 from fcslam.storage.postgres import Postgres
@@ -529,9 +530,8 @@ def _mission(folder: MissionFolder, task: WorkerTask) -> Iterator[tuple[MissionS
         return
     with closing(Postgres(task.store, f"worker of {folder.name}")) as server:
         held = Lease(*task.lease)
-        files = SharedFiles(server, held)
-        files.fetch_snapshot(folder)
-        yield MissionStore(MissionTables(server, held.mission, held)), files.put
+        fetch_snapshot(server, held, folder)
+        yield MissionStore(MissionTables(server, held.mission, held)), partial(put_file, server, held)
 
 
 def _alone(folder: MissionFolder) -> IO[str]:

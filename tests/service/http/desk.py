@@ -14,7 +14,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.cloud.stage_times import StageTotal
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Channel
-from fcslam.service.audit_log import AuditFile
+from fcslam.service.audit_log import audit_file
 from fcslam.service.http.app import create_app
 from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
 from fcslam.service.http.limits import RateLimit
@@ -82,7 +82,7 @@ class Desk:
             Authenticator(tokens),
             RateLimit(lambda: self.now, burst=2.0**21),
             EventStream(beat_s=0.0),
-            AuditFile(root / "audit.jsonl", lambda: 1e9 + self.now),
+            audit_file(root / "audit.jsonl", lambda: 1e9 + self.now),
         )
         self.app = create_app(self.state)
         self._listening = socket.create_server(("127.0.0.1", 0))

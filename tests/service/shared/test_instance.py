@@ -2,6 +2,7 @@
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from hypothesis import given
@@ -9,12 +10,14 @@ from hypothesis import strategies as st
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import InputError, StoreError
+from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.mission.mission_store import MissionStore
-from fcslam.service.intake import BusyError, LeaseError
-from fcslam.service.shared.agents import CONFIRM_S, RobotLimit, SharedAgents
-from fcslam.service.shared.audit_table import AuditTable
-from fcslam.service.shared.instance import GRACE_S, REST_LOOK_S, REST_S, Hooks, Instance, fair_part
+from fcslam.service.audit_log import audit_table
+from fcslam.service.intake import AGENT_LEASE_S, LeaseError
+from fcslam.service.shared.files import SharedDetectors
+from fcslam.service.shared.instance import GRACE_S, Instance, fair_part
 from fcslam.service.shared.mission_tables import Lease, MissionTables
+from fcslam.service.shared.missions import SharedAgents
 from fcslam.service.shared.registry import Registry
 from tests.mission.test_mission_store import packet
 
@@ -48,7 +51,7 @@ def instance(postgres, name, room=10, clock=time.monotonic):
         return workers[-1]
 
     registry = Registry(postgres, name, f"process of {name}")
-    return Instance(registry, name, room, Hooks(launch, lambda *_: None, lambda: None), clock), workers
+    return Instance(registry, name, room, launch, lambda *_: None, lambda: None, clock), workers
 
 
 EXPIRY = "fcslam.service.shared.registry._EXPIRY"
@@ -150,9 +153,9 @@ def test_two_instances_of_one_name_are_refused(registry, postgres, monkeypatch):
     one.start()
     again = Registry(postgres, "same", "another process")
     with pytest.raises(InputError, match="is called 'same'; stop it, or give this one another --port"):
-        Instance(again, "same", 1, Hooks(Started, lambda *_: None, lambda: None))
+        Instance(again, "same", 1, Started, lambda *_: None, lambda: None)
     one.close()
-    Instance(again, "same", 1, Hooks(Started, lambda *_: None, lambda: None)).close()
+    Instance(again, "same", 1, Started, lambda *_: None, lambda: None).close()
 
 
 def test_the_name_of_a_killed_instance_is_free_again(registry, postgres, monkeypatch):
@@ -160,7 +163,7 @@ def test_the_name_of_a_killed_instance_is_free_again(registry, postgres, monkeyp
         patched.setattr(EXPIRY, "clock_timestamp() + interval '0.3 seconds'")
         assert Registry(postgres, "killed", "before").register(1)
     after = Registry(postgres, "killed", "after")
-    Instance(after, "killed", 1, Hooks(Started, lambda *_: None, lambda: None)).close()
+    Instance(after, "killed", 1, Started, lambda *_: None, lambda: None).close()
 
 
 @pytest.mark.slow
@@ -199,41 +202,27 @@ def test_an_instance_takes_no_more_missions_than_it_has_room_for(registry, postg
 
 def test_a_mission_in_which_nothing_happens_rests_until_its_next_packet(registry, postgres):
     number = wanted(registry, postgres, "quiet")
-    now = [0.0]
-    one, workers = instance(postgres, "one", clock=lambda: now[0])
+    one, workers = instance(postgres, "one")
+    store = MissionStore(MissionTables(postgres, number))
 
-    def step():
-        now[0] += REST_LOOK_S
-        one._step()
+    def after(minutes):
+        postgres.rows(f"UPDATE missions SET touched = touched - interval '{minutes} minutes' RETURNING 1")
 
     one._step()
-    assert [worker.lease.mission for worker in workers] == [number]
-    store = MissionStore(MissionTables(postgres, number))
-    for k in range(round(REST_S / REST_LOOK_S)):
-        if k == 10:
-            store.put([packet()], 0.0)
-        step()
+    after(29)
+    store.put([packet()], 0.0)
+    after(29)
+    one._step()
     assert held(registry) == {"quiet": "one"}
-    for _ in range(14):
-        step()
-    assert held(registry) == {}
+    after(2)
+    one._step()
+    until(lambda: held(registry) == {})
     assert workers[0].is_stopped
     store.put([packet(sequence=1)], 0.0)
     one._step()
     assert held(registry) == {"quiet": "one"}
     assert workers[1].lease.fence == 2
     one.close()
-
-
-def test_a_packet_in_the_last_moment_keeps_a_mission_awake(registry, postgres):
-    number = wanted(registry, postgres, "awake")
-    (lease,) = registry.claim(1)
-    before = registry.activity(lease)
-    MissionStore(MissionTables(postgres, number)).put([packet()], 0.0)
-    registry.let_rest(lease, before)
-    assert [mission.is_wanted for mission in registry.missions()] == [True]
-    registry.let_rest(lease, registry.activity(lease))
-    assert [mission.is_wanted for mission in registry.missions()] == [False]
 
 
 @given(wanted=st.integers(0, 60), rooms=st.lists(st.integers(0, 30), min_size=1, max_size=6))
@@ -248,36 +237,33 @@ def test_parts_hold_all_missions_if_there_is_room_and_differ_only_where_there_is
 def test_another_agent_is_refused_by_every_instance(registry, postgres):
     number = wanted(registry, postgres, "robots")
     now = [0.0]
-    here, there = (SharedAgents(postgres, number, RobotLimit(9, lambda: now[0]), lambda: now[0]) for _ in range(2))
+    here, there = (SharedAgents(postgres, number, lambda: now[0]) for _ in range(2))
     here.hold("a", "x")
     there.hold("b", "y")
     with pytest.raises(LeaseError, match="another agent speaks for this robot"):
         there.hold("a", "z")
     there.hold("a", "x")  # a robot may change the instance
-    now[0] += CONFIRM_S
+    now[0] += AGENT_LEASE_S
     here.hold("a", "x")
     assert there.silent_s("a") < 5.0
     assert there.silent_s("c") is None
 
 
-def test_a_full_instance_sends_robots_to_another_one(registry, postgres):
-    number = wanted(registry, postgres, "full")
-    now = [0.0]
-    limit = RobotLimit(2, lambda: now[0])
-    agents = SharedAgents(postgres, number, limit, lambda: now[0])
-    for robot in "aba":
-        agents.hold(robot, "x")
-    with pytest.raises(BusyError, match="takes 2 robots"):
-        agents.hold("c", "x")
-    now[0] = 31.0
-    agents.hold("c", "x")
-
-
 def test_the_audit_log_has_the_lines_of_all_instances(registry, postgres):
-    tables = [AuditTable(postgres, name) for name in ("one", "two")]
-    for k in range(4):
-        tables[k % 2].append(f'{{"line": {k}}}'.encode())
-        until(lambda k=k: tables[0].lines(1) == [f'{{"line": {k}}}'.encode()])
-    assert [line[-2:] for line in tables[1].lines(3)] == [b"1}", b"2}", b"3}"]
-    for table in tables:
-        table.close()
+    with ThreadPoolExecutor(1) as writer:
+        logs = [audit_table(postgres, name, writer) for name in ("one", "two")]
+        for k in range(4):
+            logs[k % 2].record("boss", "", "POST /x", 200, {"number": k})
+    assert [entry.content["number"] for entry in logs[1].newest(3)] == [1, 2, 3]
+
+
+def test_other_instances_announce_a_detector_and_have_its_file(registry, postgres, tmp_path):
+    one, other = (SharedDetectors(tmp_path / name, postgres) for name in ("one", "other"))
+    file = one.announce(BUNDLED_NETWORK.read_bytes())
+    assert file.channel not in other.announced()
+    nothing = lambda *_: None  # noqa: E731
+    following = Instance(registry, "one", 0, nothing, nothing, other.follow)
+    following._step()
+    following.close()
+    assert other.announced() == {file.channel: file}
+    assert other.path(file.channel, file.version).read_bytes() == BUNDLED_NETWORK.read_bytes()

@@ -11,7 +11,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import StoreError
 from fcslam.mission.mission_store import TABLES, MissionStore, StoredPacket, check_mission
 from fcslam.records import Removal, Veto, frozen
-from fcslam.service.shared.files import SharedFiles, fetch_folder, fetched
+from fcslam.service.shared.files import fetch_folder, fetched, put_file
 from fcslam.service.shared.mission_tables import LeaseLostError, MissionTables
 from fcslam.storage.postgres import Postgres
 from tests.mission.test_mission_store import correction, packet
@@ -72,10 +72,10 @@ def test_a_worker_that_lost_its_lease_writes_nothing(registry, postgres, tmp_pat
     number = registry.create("fenced")
     MissionStore(MissionTables(postgres, number)).put([packet()], 0.0)
     (old,) = registry.claim(1)
-    worker, files = MissionStore(MissionTables(postgres, number, old)), SharedFiles(postgres, old)
+    worker = MissionStore(MissionTables(postgres, number, old))
     (tmp_path / "snapshot").write_bytes(b"old")
     worker.progress(1, [correction("a", 1.0)])
-    files.put("snapshot", tmp_path / "snapshot")
+    put_file(postgres, old, "snapshot", tmp_path / "snapshot")
     registry.release(old)
     (new,) = registry.claim(1)
     assert new.fence == old.fence + 1
@@ -83,7 +83,7 @@ def test_a_worker_that_lost_its_lease_writes_nothing(registry, postgres, tmp_pat
         lambda: worker.progress(2, [correction("a", 9.0)]),
         lambda: worker.refuse("a", 0, 0, "no"),
         lambda: worker.answer(1, "1"),
-        lambda: files.put("snapshot", tmp_path / "missing"),
+        lambda: put_file(postgres, old, "snapshot", tmp_path / "missing"),
     ):
         (tmp_path / "missing").write_bytes(b"new")
         with pytest.raises(LeaseLostError, match="another worker has it"):
@@ -118,7 +118,7 @@ def test_a_run_folder_travels_as_it_is(registry, postgres, tmp_path):
     (folder / "trajectories" / "a.tum").write_bytes(bytes(range(256)))
     (folder / "map.png").write_bytes(b"png" * 1000)
     assert not fetch_folder(postgres, number, "live", tmp_path / "seen" / "1")
-    SharedFiles(postgres, lease).put("live", folder)
+    put_file(postgres, lease, "live", folder)
     assert fetch_folder(postgres, number, "live", tmp_path / "seen" / "1")
     for path in (folder / "trajectories" / "a.tum", folder / "map.png"):
         assert (tmp_path / "seen" / "1" / path.relative_to(folder)).read_bytes() == path.read_bytes()

@@ -4,9 +4,8 @@ import pytest
 
 from fcslam.errors import StoreError
 from fcslam.mission.mission_store import MissionStore
-from fcslam.service.shared.mission_tables import MissionTables
+from fcslam.service.shared.mission_tables import VERSION, MissionTables, prepare
 from fcslam.service.shared.registry import Registry
-from fcslam.service.shared.schema import VERSION, prepare
 from fcslam.storage.postgres import Postgres
 
 
@@ -38,7 +37,7 @@ def test_tables_are_made_once_and_kept(server):
 
 def test_a_store_of_another_version_is_refused_in_one_line(server):
     prepare(server)
-    server.rows("UPDATE fcslam.version SET number = 2 RETURNING 1")
-    with pytest.raises(StoreError, match=r"a store of version 2; this fcslam reads version 1") as caught:
+    server.rows("UPDATE fcslam.version SET number = 1 RETURNING 1")
+    with pytest.raises(StoreError, match=r"a store of version 1; this fcslam reads version 2") as caught:
         prepare(server)
     assert "\n" not in str(caught.value)

@@ -8,8 +8,7 @@ from typing import Final
 from fcslam.records import Channel, DetectorFile
 from fcslam.service.detectors import DetectorStore
 from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.shared.mission_tables import Lease, check_lease
-from fcslam.service.shared.schema import schema_of
+from fcslam.service.shared.mission_tables import Lease, check_lease, schema_of
 from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing_folder, write_file
 from fcslam.storage.postgres import Postgres, PostgresTransaction
@@ -21,45 +20,38 @@ RESULT: Final = "result "
 """Names of what is shared; that of a result ends with its number."""
 
 
-class SharedFiles:
-    """The files that a worker with a lease shares."""
+def put_file(server: Postgres, lease: Lease, name: str, path: Path) -> None:
+    """Store a file, or a folder as one file, of a worker with a lease in place of the one of this name.
 
-    def __init__(self, server: Postgres, lease: Lease) -> None:
-        self._server, self._lease = server, lease
+    Raises:
+        StoreError: it cannot be stored.
+        LeaseLostError: another worker has the mission.
+    """
+    with translate_errors(path):
+        content = _packed(path) if path.is_dir() else path.read_bytes()
+    # Without the lock of those who store packets: this may take a while.
+    with server.connection(f"BEGIN; SET LOCAL search_path TO {schema_of(lease.mission)}") as connection:
+        transaction = PostgresTransaction(connection)
+        check_lease(transaction, lease)
+        transaction.execute(
+            "INSERT INTO files VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET content = excluded.content",
+            (name, content),
+        )
+        counted = "live" if name == LIVE else "finalized" if name.startswith(RESULT) else None
+        if counted is not None:
+            statement = f"UPDATE fcslam.missions SET {counted} = {counted} + 1 WHERE number = ?"
+            transaction.execute(statement, (lease.mission,))
+        connection.execute("COMMIT")
 
-    def put(self, name: str, path: Path) -> None:
-        """Store a file, or a folder as one file, in place of the one of this name.
 
-        Raises:
-            StoreError: it cannot be stored.
-            LeaseLostError: another worker has the mission.
-        """
-        with translate_errors(path):
-            content = _packed(path) if path.is_dir() else path.read_bytes()
-        # Without the lock of those who store packets: this may take a while.
-        begin = f"BEGIN; SET LOCAL search_path TO {schema_of(self._lease.mission)}"
-        with self._server.connection(begin) as connection:
-            transaction = PostgresTransaction(connection)
-            check_lease(transaction, self._lease)
-            transaction.execute(
-                "INSERT INTO files VALUES (?, 1, ?) ON CONFLICT (name) DO UPDATE"
-                " SET number = files.number + 1, content = excluded.content",
-                (name, content),
-            )
-            counted = "live" if name == LIVE else "finalized" if name.startswith(RESULT) else None
-            if counted is not None:
-                statement = f"UPDATE fcslam.missions SET {counted} = {counted} + 1 WHERE number = ?"
-                transaction.execute(statement, (self._lease.mission,))
-            connection.execute("COMMIT")
-
-    def fetch_snapshot(self, folder: MissionFolder) -> None:
-        """Write the snapshot of the worker before into a mission's folder."""
-        found = fetched(self._server, self._lease.mission, SNAPSHOT)
-        with translate_errors(folder.snapshot):
-            if found is None:
-                folder.snapshot.unlink(missing_ok=True)
-            else:
-                write_file(folder.snapshot, found)
+def fetch_snapshot(server: Postgres, lease: Lease, folder: MissionFolder) -> None:
+    """Write the snapshot of the worker before into a mission's folder."""
+    found = fetched(server, lease.mission, SNAPSHOT)
+    with translate_errors(folder.snapshot):
+        if found is None:
+            folder.snapshot.unlink(missing_ok=True)
+        else:
+            write_file(folder.snapshot, found)
 
 
 def fetched(server: Postgres, mission: int, name: str) -> bytes | None:

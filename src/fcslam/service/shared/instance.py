@@ -1,10 +1,12 @@
 """One of several instances of the service: its name, its part of the workers, and what it sees of the others."""
 
 import logging
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 from fcslam.errors import InputError, StoreError
 from fcslam.service.shared.mission_tables import Lease
@@ -13,29 +15,12 @@ from fcslam.service.supervisor import RunningWorker
 
 LOOK_S: Final = 0.5
 """Between two renewals of the leases."""
-REST_LOOK_S: Final = 60.0
-"""Between two looks which missions had nothing to do."""
-REST_S: Final = 1800.0
-"""A mission in which nothing happened for so long needs no worker."""
 GRACE_S: Final = 1.5
 """After the store was gone, the others get so long to renew leases that ended meanwhile."""
 NAME_S: Final = LEASE_S + 2.0
 """How long a new instance waits for its name: one that was killed loses it in this time."""
 
 _log = logging.getLogger(__name__)
-
-
-class Hooks(NamedTuple):
-    """What an instance calls."""
-
-    launch: Callable[[KnownMission, Lease], RunningWorker]
-    """Starts the worker of a mission."""
-    listen: Callable[[str, int, str], None]
-    """Receives an event, its number and the name of its mission, whoever has the mission's worker."""
-    on_taken: Callable[[], None]
-    """Called when another process has taken the name, after this one was gone for a while."""
-    follow: Callable[[], None] = lambda: None
-    """Called at each step, to take over what other instances put into the store."""
 
 
 class Instance:
@@ -46,19 +31,29 @@ class Instance:
         registry: Registry,
         name: str,
         most_missions: int,
-        hooks: Hooks,
+        launch: Callable[[KnownMission, Lease], RunningWorker],
+        listen: Callable[[str, int, str], None],
+        follow: Callable[[], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take the name; ``most_missions``: how many workers it runs."""
-        self._registry, self._name, self._most, self._hooks, self._clock = registry, name, most_missions, hooks, clock
+        """Take the name.
+
+        Args:
+            registry: the missions.
+            name: of this instance.
+            most_missions: how many workers it runs.
+            launch: starts the worker of a mission.
+            listen: receives an event, its number and the name of its mission, whoever has the mission's worker.
+            follow: called at each step, to take over what other instances put into the store.
+            clock: seconds.
+        """
+        self._registry, self._name, self._most, self._clock = registry, name, most_missions, clock
+        self._launch, self._listen, self._follow = launch, listen, follow
         self._closing = threading.Event()
         self._take_name()
         self._held: dict[Lease, RunningWorker] = {}
         self._ending: dict[Lease, threading.Thread] = {}
         """Workers that do their last step; nobody else may begin before."""
-        self._active: dict[Lease, tuple[tuple[Any, ...], float]] = {}
-        """Activity of each mission, and since when it is the same."""
-        self._rest_look_at = clock() + REST_LOOK_S
         self._claims_from = clock()
         self.known: Mapping[str, KnownMission] = {}
         """All missions by name, as they were a moment ago."""
@@ -93,9 +88,9 @@ class Instance:
         for name, mission in self.known.items():
             old = before.get(name)
             if old is not None and mission.live > old.live:
-                self._hooks.listen("live", mission.live, name)
+                self._listen("live", mission.live, name)
             if old is not None and mission.finalized > old.finalized:
-                self._hooks.listen("finalized", mission.finalized, name)
+                self._listen("finalized", mission.finalized, name)
 
     def _take_name(self) -> None:
         for _ in range(round(NAME_S / LOOK_S)):
@@ -121,7 +116,7 @@ class Instance:
     def _step(self) -> None:
         if not self._registry.register(self._most):
             _log.error("another instance took the name '%s'; this one stops", self._name)
-            self._hooks.on_taken()
+            os.kill(os.getpid(), signal.SIGTERM)
             self._closing.set()
             return
         ending = [(lease, False) for lease in list(self._ending)]
@@ -129,26 +124,13 @@ class Instance:
         for lease in self._held.keys() - kept:
             _log.warning("mission %d has a worker on another instance now", lease.mission)
             threading.Thread(target=self._held.pop(lease).stop, daemon=True).start()
+        self._registry.let_rest()
         self.look()
-        self._hooks.follow()
-        self._let_rest()
-        self._spread()
-
-    def _let_rest(self) -> None:
+        self._follow()
         resting = {mission.number for mission in self.known.values() if not mission.is_wanted}
         for lease in [lease for lease in self._held if lease.mission in resting]:
             self._end(lease)
-        now = self._clock()
-        if now < self._rest_look_at:
-            return
-        self._rest_look_at = now + REST_LOOK_S
-        before, self._active = self._active, {}
-        for lease in self._held:
-            activity = self._registry.activity(lease)
-            known, since = before.get(lease, (activity, now))
-            self._active[lease] = activity, since if known == activity else now
-            if now >= self._active[lease][1] + REST_S:
-                self._registry.let_rest(lease, activity)
+        self._spread()
 
     def _spread(self) -> None:
         """Take missions without a worker, or give one up, until each instance has its part."""
@@ -159,7 +141,7 @@ class Instance:
         if is_any_free and may_claim and len(self._held) < part:
             for lease in self._registry.claim(part - len(self._held)):
                 mission = next(mission for mission in self._registry.missions() if mission.number == lease.mission)
-                self._held[lease] = self._hooks.launch(mission, lease)
+                self._held[lease] = self._launch(mission, lease)
         elif not is_any_free and not self._ending and len(self._held) > part:
             self._end(next(reversed(self._held)))
 

@@ -13,13 +13,12 @@ from typing import Final
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import InputError
 from fcslam.mission.mission_store import MissionStore
-from fcslam.service.intake import Intake, SessionState
+from fcslam.service.intake import AGENT_LEASE_S, Agents, Intake, SessionState, held_by_another
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, locked, sweep
-from fcslam.service.shared.agents import RobotLimit, SharedAgents
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SharedDetectors, fetch_folder, fetched
-from fcslam.service.shared.instance import Hooks, Instance
-from fcslam.service.shared.mission_tables import MissionTables
+from fcslam.service.shared.instance import Instance
+from fcslam.service.shared.mission_tables import Lease, MissionTables, schema_of
 from fcslam.service.shared.registry import KnownMission, Registry
 from fcslam.service.supervisor import Elsewhere, RunningWorker
 from fcslam.service.viewed_mission import PacketCounts
@@ -35,6 +34,44 @@ _SEEN: Final = "seen"
 
 _JOINT_LOOK_S: Final = 1.0
 """Between two looks for joint maps that a worker elsewhere shared."""
+
+
+class SharedAgents(Agents):
+    """The agents of one mission's robots, known to all instances, which ask the store now and then."""
+
+    def __init__(self, server: Postgres, mission: int, clock: Callable[[], float]) -> None:
+        super().__init__(clock)
+        self._server, self._schema = server, schema_of(mission)
+        self._confirmed: dict[str, tuple[str, float]] = {}
+        """By robot, the agent that the store named last, and when."""
+
+    def hold(self, robot: str, agent: str) -> None:
+        """Let an agent speak for a robot."""
+        now, (known, asked) = self._clock(), self._confirmed.get(robot, ("", 0.0))
+        if known != agent or now >= asked + AGENT_LEASE_S / 3.0:
+            taken = self._server.rows(
+                "INSERT INTO agents VALUES (?, ?, clock_timestamp()) ON CONFLICT (robot) DO UPDATE"
+                " SET agent = excluded.agent, heard = clock_timestamp() WHERE agents.agent = excluded.agent"
+                f" OR agents.heard < clock_timestamp() - interval '{AGENT_LEASE_S} seconds' RETURNING 1",
+                (robot, agent),
+                self._schema,
+            )
+            if not taken:
+                raise held_by_another(robot, AGENT_LEASE_S)
+            self._confirmed[robot] = agent, now
+        self.note(robot, agent)
+
+    def silent_s(self, robot: str) -> float | None:
+        """Seconds since the robot's last batch to this instance, or about that to another one; None: never."""
+        here = super().silent_s(robot)
+        rows = self._server.rows(
+            "SELECT CAST(extract(epoch FROM clock_timestamp() - heard) AS DOUBLE PRECISION) FROM agents"
+            " WHERE robot = ?",
+            (robot,),
+            self._schema,
+        )
+        known = [silent for silent in (here, *(float(silent) for (silent,) in rows)) if silent is not None]
+        return min(known, default=None)
 
 
 class SharedMission(OpenMission):
@@ -127,13 +164,13 @@ class SharedMissions:
         server: Postgres,
         name: str,
         most_missions: int,
-        most_robots: int,
-        hooks: Hooks,
+        launch: Callable[[KnownMission, Lease], RunningWorker],
+        listen: Callable[[str, int, str], None],
     ) -> None:
         """Take the instance's name, and create the first mission if the server has no mission.
 
-        Files in ``root`` are this instance's own, and can be made again from the store. At a time, the instance runs
-        ``most_missions`` workers, and ``most_robots`` robots send to it.
+        Files in ``root`` are this instance's own, and can be made again from the store. The other arguments are those
+        of an ``Instance``.
         """
         self.root = root
         self.closing: Callable[[], object] = lambda: None
@@ -145,13 +182,12 @@ class SharedMissions:
             for seen in root.glob(f"missions/*/{_SEEN}"):
                 shutil.rmtree(seen, ignore_errors=True)
             self.detectors = SharedDetectors(root / "detectors", server)
-            self._robots = RobotLimit(most_robots, time.monotonic)
             self._registry = Registry(server, name, secrets.token_hex(8))
             self._opening = threading.Lock()
             self._opened: dict[str, SharedMission] = {}
             self.detectors.follow()
-            hooks = hooks._replace(follow=self.detectors.follow)
-            self._instance = Instance(self._registry, name, most_missions, hooks)
+            follow = self.detectors.follow
+            self._instance = Instance(self._registry, name, most_missions, launch, listen, follow)
             if not any(known.is_open for known in self._instance.known.values()):
                 self._open_first()
             self._instance.start()
@@ -228,7 +264,7 @@ class SharedMissions:
                     folder.path.mkdir(parents=True, exist_ok=True)
                 store = MissionStore(MissionTables(self._server, known.number))
                 settings = store.configure(self._config).fleet
-                agents = SharedAgents(self._server, known.number, self._robots, time.monotonic)
+                agents = SharedAgents(self._server, known.number, time.monotonic)
                 intake = Intake(store, time.monotonic, time.time, self.detectors.announced, settings.claims, agents)
                 self._opened[name] = SharedMission(known.number, folder, self._server, store, intake, self._instance)
             return self._opened[name]

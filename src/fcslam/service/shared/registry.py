@@ -4,11 +4,10 @@ All times are of the server's clock, so a wrong clock of an instance does no har
 """
 
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from fcslam.errors import InputError
-from fcslam.service.shared.mission_tables import Lease, MissionTables
-from fcslam.service.shared.schema import mission_statements, schema_of
+from fcslam.service.shared.mission_tables import Lease, mission_statements
 from fcslam.storage.postgres import Postgres
 
 LEASE_S: Final = 3.0
@@ -16,11 +15,6 @@ LEASE_S: Final = 3.0
 _READ: Final = """
 SELECT number, name, is_open, is_wanted, holder, expires > clock_timestamp(), is_ready, live, finalized
 FROM missions ORDER BY name
-"""
-_ACTIVITY: Final = """
-SELECT (SELECT max(arrival) FROM packets), (SELECT max(number) FROM edits), (SELECT max(number) FROM finalizations),
-       (SELECT count(*) FROM finalizations WHERE run IS NULL AND failure IS NULL),
-       (SELECT value FROM facts WHERE name = 'applied')
 """
 _EXPIRY: Final = f"clock_timestamp() + interval '{LEASE_S} seconds'"
 
@@ -99,14 +93,16 @@ class Registry:
         with self._server.connection("BEGIN; LOCK TABLE fcslam.missions IN SHARE ROW EXCLUSIVE MODE") as connection:
             connection.execute("UPDATE fcslam.missions SET is_open = false WHERE is_open")
             connection.execute(
-                "UPDATE fcslam.missions SET is_open = true, is_wanted = true WHERE number = %s", (number,)
+                "UPDATE fcslam.missions SET is_open = true, is_wanted = true, touched = clock_timestamp()"
+                " WHERE number = %s",
+                (number,),
             )
             connection.execute("COMMIT")
 
     def claim(self, most: int) -> list[Lease]:
         """Take up to ``most`` missions that need a worker and have none, each with a new fencing number."""
         claimed = self._server.rows(
-            "UPDATE missions SET holder = ?, fence = fence + 1, is_ready = false,"
+            "UPDATE missions SET holder = ?, fence = fence + 1, is_ready = false, touched = clock_timestamp(),"
             f" expires = {_EXPIRY} WHERE number IN (SELECT number FROM missions"
             " WHERE is_wanted AND expires < clock_timestamp() ORDER BY number LIMIT ? FOR UPDATE SKIP LOCKED)"
             " RETURNING number, fence",
@@ -136,17 +132,9 @@ class Registry:
             (lease.mission, lease.fence),
         )
 
-    def activity(self, lease: Lease) -> tuple[Any, ...]:
-        """Counts that change when a mission gets packets, edits or requests, or its worker answers them."""
-        return self._server.rows(_ACTIVITY, (), schema_of(lease.mission))[0]
-
-    def let_rest(self, lease: Lease, activity: tuple[Any, ...]) -> None:
-        """Note that a mission needs no worker, unless something happened since ``activity``; the next packet, edit or
-        request changes that.
-
-        Raises:
-            LeaseLostError: another worker has the mission.
-        """
-        with MissionTables(self._server, lease.mission, lease).transaction() as transaction:
-            if transaction.execute(_ACTIVITY).fetchone() == activity:
-                transaction.execute("UPDATE fcslam.missions SET is_wanted = false WHERE number = ?", (lease.mission,))
+    def let_rest(self) -> None:
+        """Note which missions need no worker: those for which one wrote nothing for half an hour, and nobody else."""
+        self._server.rows(
+            "UPDATE missions SET is_wanted = false WHERE is_wanted AND expires > clock_timestamp()"
+            " AND touched < clock_timestamp() - interval '30 minutes' RETURNING 1"
+        )
