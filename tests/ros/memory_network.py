@@ -12,7 +12,6 @@ class MemoryNetwork:
         self.others = list(others)
         self.sent = defaultdict(list)
         self.subscribed = {}
-        self.services = {}
         self._own = []
         self._subscribers = defaultdict(list)
         self._codec = MessageCodec(ros1=False)
@@ -28,9 +27,6 @@ class MemoryNetwork:
     def publisher(self, topic, kind, quality):
         self._own.append(Endpoint(topic, kind, True, quality, True))
         return lambda payload: self.sent[topic].append(self._codec.decode(payload, kind))
-
-    def serve(self, service, act):
-        self.services[service] = act
 
     def close(self):
         pass

@@ -3,13 +3,12 @@
 import socket
 import threading
 import time
-from concurrent.futures import Future
 
 import numpy as np
 import pytest
 
 from fcslam.errors import InputError
-from fcslam.ros.network import Answer, Endpoint, Quality
+from fcslam.ros.network import Endpoint, Quality
 from fcslam.ros.ros2_zenoh import ZenohNetwork, attachment, endpoint_of, quality_text, session_config
 from fcslam.sources.bags.codec import SCAN, TRANSFORMS
 from tests.ros.ros_messages import CODEC, encoded, scan, transform
@@ -104,21 +103,6 @@ def test_own_messages_do_not_come_back(network, peer):
     wait_for(lambda: publish(HELLO) or heard.is_set())
     wait_for(lambda: put(WORLD) or came)
     assert set(came) == {WORLD}
-
-
-def test_a_service_answers_with_the_identity_of_the_request(network, peer):
-    def act():
-        done = Future()
-        done.set_result(Answer(True, "the drive ends"))
-        return done
-
-    network.serve("/robot1/fcslam/finish", act)
-    wait_for(lambda: any(words[0] == "SS" for words in peer.graph()))
-    payload, attached = peer.call("/robot1/fcslam/finish")
-    assert payload[4:5] == b"\x01"
-    assert b"the drive ends\x00" in payload
-    assert attached[:8] == (7).to_bytes(8, "little")
-    assert attached[16:] == b"\x10" + bytes(range(16))
 
 
 def test_the_bridge_shows_itself_as_a_node_of_ros(network, peer):

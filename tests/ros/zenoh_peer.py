@@ -18,7 +18,6 @@ HASHES = {
     "tf2_msgs/TFMessage": "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
     "std_msgs/String": "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
 }
-TRIGGER = "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
 RELIABLE, BEST_EFFORT, LATCHED = "::,10:,:,:,,", "2::,5:,:,:,,", ":1:,1:,:,:,,"
 
 
@@ -96,13 +95,6 @@ class ZenohPeer:
         else:
             self.tokens.append(self.session.declare_subscriber(key, checked))
         self._declare("MS", topic.replace("/", "%"), *key.split("/")[-2:], quality)
-
-    def call(self, service):
-        """The payload and the attachment of the response of a Trigger."""
-        key = f"{self.domain}{service}/std_srvs::srv::dds_::Trigger_/{TRIGGER}"
-        replies = self.session.get(key, payload=b"\x00\x01\x00\x00\x00", attachment=attached(7), timeout=20.0)
-        (reply,) = [reply.ok for reply in replies]
-        return reply.payload.to_bytes(), reply.attachment.to_bytes()
 
     def graph(self):
         """The entities of the domain as rmw_zenoh reads their tokens: 9 words of a node, 13 of an endpoint."""

@@ -4,27 +4,12 @@ Messages are bytes here; ``sources.bags.codec`` decodes them, as for bags.
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
-from typing import Final, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 Deliver = Callable[[bytes], object]
 """Called with the bytes of each message, in a thread of the network."""
 Publish = Callable[[bytes], None]
 """Sends the bytes of one message. Any thread may call it."""
-
-TRIGGER: Final = "std_srvs/Trigger"
-"""Type of all services: a request without fields."""
-
-
-class Answer(NamedTuple):
-    """The response of a service of the type ``TRIGGER``; its fields have the names of that type."""
-
-    success: bool
-    message: str
-
-
-Act = Callable[[], Future[Answer]]
-"""Does what a service is for; called for each request, in a thread of the network."""
 
 
 class Quality(NamedTuple):
@@ -62,9 +47,6 @@ class RosNetwork(Protocol):
 
     def publisher(self, topic: str, kind: str, quality: Quality) -> Publish:
         """Begin to publish a topic."""
-
-    def serve(self, service: str, act: Act) -> None:
-        """Begin to serve requests of the type ``TRIGGER``."""
 
     def close(self) -> None:
         """Leave the network; nothing is delivered afterwards."""

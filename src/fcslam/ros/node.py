@@ -1,15 +1,13 @@
 """A live robot on a ROS network: reads its sensors, maps, and publishes map and pose.
 
 The thread that calls ``run`` reads messages. A second thread publishes ``map -> odom`` at a fixed rate. A third one
-publishes the map, the path and diagnostics, and a fourth one obeys commands. So none of them delays the pose of a scan.
+publishes the map, the path and diagnostics, and saves the map. So none of them delays the pose of a scan.
 """
 
 import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +20,7 @@ from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock
 from fcslam.ros.inbox import Inbox
 from fcslam.ros.live_plan import Notify
-from fcslam.ros.network import Answer, Endpoint, Quality, RosNetwork, qos_conflict
+from fcslam.ros.network import Endpoint, Quality, RosNetwork, qos_conflict
 from fcslam.ros.outputs import MAP, OWN_MAP, POSE, Outputs, nanoseconds
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.sensors import LiveSensors
@@ -43,8 +41,8 @@ STRING, EMPTY = "std_msgs/String", "std_msgs/Empty"
 SAVE_MAP, FINISH, FLOOR, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "fcslam/floor", "initialpose"
 MOST_WAITING_BYTES = 64_000_000
 """Of messages that wait to be read; beyond, newer ones are lost."""
-_COMMANDS_WAITING = 8
-"""Most commands that wait; anybody on the network may send them."""
+_NAMES_WAITING = 8
+"""Most maps that wait to be saved; anybody on the network may ask for them."""
 _LINES_TOLD = 1000
 """Largest number of different lines that are printed; the names in some come from the network."""
 _POLL_S = 0.1
@@ -111,7 +109,8 @@ class RobotNode:
             MOST_WAITING_BYTES,
             lambda: self._tell_once("messages come faster than this computer can map; some are lost"),
         )
-        self._commands: queue.Queue[tuple[Callable[[], Answer], Future[Answer]]] = queue.Queue(_COMMANDS_WAITING)
+        self._names: queue.Queue[str] = queue.Queue(_NAMES_WAITING)
+        """Of the files of maps to be saved."""
         self._stop = threading.Event()
         self._told: set[str] = set()
         self.scans = 0
@@ -138,7 +137,6 @@ class RobotNode:
             threading.Thread(target=self._publish_transforms, name="tf", daemon=True),
             threading.Thread(target=self._publish_maps, name="maps", daemon=True),
             threading.Thread(target=self._publish_fleet, name="fleet topics", daemon=True),
-            threading.Thread(target=self._obey, name="commands", daemon=True),
         ]
         for thread in threads:
             thread.start()
@@ -282,6 +280,7 @@ class RobotNode:
         while not self._stop.wait(1.0):
             self.watch_network()
             self._diagnose()
+            self._save_maps()
             is_due = time.monotonic() >= due_s and self.scans != drawn
             try:
                 if not is_due:
@@ -313,57 +312,40 @@ class RobotNode:
     def _subscribe(self) -> None:
         self._inbox.subscribe(self._network, self._topics.kinds, _DEPTHS, self._clock.now_ns)
         commands: list[tuple[str, str, Callable[[bytes], object]]] = [
-            (SAVE_MAP, STRING, lambda payload: self._ask(partial(self._save_map, payload))),
+            (SAVE_MAP, STRING, self._take_name),
             (FINISH, EMPTY, lambda _: self.stop()),
             (INITIAL_POSE, POSE, self._take_pose),
             (FLOOR, STRING, self._take_floor),
         ]
         for name, kind, command in commands:
             self._network.subscribe(resolved(self._namespace, name), kind, Quality(reliable=True), command)
-        self._network.serve(resolved(self._namespace, SAVE_MAP), lambda: self._ask(self._save_map))
-        self._network.serve(resolved(self._namespace, FINISH), lambda: self._ask(self._finish))
         if self._clock.simulated:
             self._network.subscribe(
                 CLOCK_TOPIC, CLOCK, Quality(reliable=False), lambda payload: self._clock.tick(payload, self._codec)
             )
 
-    def _ask(self, command: Callable[[], Answer]) -> Future[Answer]:
-        asked: Future[Answer] = Future()
+    def _take_name(self, payload: bytes) -> None:
+        """Save the map soon; the message is its name, else it is the robot's."""
         try:
-            self._commands.put_nowait((command, asked))
-        except queue.Full:
-            asked.set_result(Answer(False, f"{_COMMANDS_WAITING} commands wait already; ask again later"))
-        return asked
-
-    def _obey(self) -> None:
-        while not self._stop.is_set():
-            try:
-                command, asked = self._commands.get(timeout=_POLL_S)
-            except queue.Empty:
-                continue
-            asked.set_result(command())
-        while not self._commands.empty():
-            self._commands.get()[1].set_result(Answer(False, "the drive has ended"))
-
-    def _finish(self) -> Answer:
-        self.stop()
-        return Answer(True, "the drive ends")
-
-    def _save_map(self, payload: bytes | None = None) -> Answer:
-        """Write the files of map_server to this process's folder; the message is their name, else the robot's."""
-        try:
-            name = self._robot.name if payload is None else self._codec.decode(payload, STRING).data or self._robot.name
+            name = self._codec.decode(payload, STRING).data or self._robot.name
             if not NAME.fullmatch(name):  # anybody on the network may send it
                 raise ValueError(f"{name!r} is not a name; give letters, digits and . _ -, without a folder")
-            occupancy = self._robot.map()
-            write_file(Path(f"{name}.pgm"), pgm_bytes(occupancy))
-            write_file(Path(f"{name}.yaml"), map_yaml(occupancy, f"{name}.pgm"))
-        except (ValueError, OSError, FcslamError) as error:
-            answer = Answer(False, f"the map cannot be saved: {error}")
-        else:
-            answer = Answer(True, f"map saved: {Path(f'{name}.yaml').absolute()}")
-        self._notify(answer.message)
-        return answer
+            self._names.put_nowait(name)
+        except (ValueError, queue.Full) as error:
+            self._notify(f"the map cannot be saved: {error or 'too many wait'}")
+
+    def _save_maps(self) -> None:
+        """Write the files of map_server to this process's folder."""
+        while not self._names.empty():
+            name = self._names.get()
+            try:
+                occupancy = self._robot.map()
+                write_file(Path(f"{name}.pgm"), pgm_bytes(occupancy))
+                write_file(Path(f"{name}.yaml"), map_yaml(occupancy, f"{name}.pgm"))
+            except (OSError, FcslamError) as error:
+                self._notify(f"the map cannot be saved: {error}")
+            else:
+                self._notify(f"map saved: {Path(f'{name}.yaml').absolute()}")
 
     def _take_pose(self, payload: bytes) -> None:
         """Try a pose that somebody gives, as by RViz's "2D Pose Estimate"."""

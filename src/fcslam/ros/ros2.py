@@ -2,9 +2,6 @@
 
 The types of messages are not declared: DDS carries them as bytes. Publishers and subscriptions of Fast DDS, the usual
 middleware of ROS 2, match by name only if Cyclone ignores descriptions of types.
-
-A service is a topic of requests and one of responses. Cyclone DDS puts the identity of a request before its contents;
-Fast DDS puts it where Cyclone DDS cannot write it. So a call from Fast DDS takes effect, but gets no response.
 """
 
 import logging
@@ -12,14 +9,12 @@ import os
 import re
 import threading
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
 from fcslam.errors import InputError
-from fcslam.ros.network import TRIGGER, Act, Answer, Deliver, Endpoint, Publish, Quality
-from fcslam.sources.bags.codec import TRIGGER_RESPONSE, MessageCodec
+from fcslam.ros.network import Deliver, Endpoint, Publish, Quality
 
 _log = logging.getLogger(__name__)
 
@@ -32,8 +27,6 @@ _ENDPOINTS_READ = _ENDPOINTS_KNOWN = 10_000
 _MESSAGES_TAKEN = 64
 _WAIT_NS = 200_000_000
 _BLOCKING_NS = 100_000_000
-_HEADER_BYTES, _IDENTITY_BYTES = 4, 16
-"""Sizes of a message's encoding header, and of the caller and number in front of a request."""
 _TOPIC = re.compile(r"rt(/.+)")
 _TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")
 _PEER = re.compile(r"[\w.:-]+", re.ASCII)
@@ -94,50 +87,21 @@ class Ros2Network:
 
     def subscribe(self, topic: str, kind: str, quality: Quality, deliver: Deliver) -> None:
         """As in RosNetwork."""
-        self._read(f"rt{topic}", dds_type(kind), quality, deliver)
-
-    def publisher(self, topic: str, kind: str, quality: Quality) -> Publish:
-        """As in RosNetwork."""
-        return self._writer(f"rt{topic}", dds_type(kind), quality)
-
-    def serve(self, service: str, act: Act) -> None:
-        """As in RosNetwork; callers on Fast DDS get no response."""
-        kind, quality, codec = dds_type(TRIGGER, "srv"), Quality(reliable=True), MessageCodec(ros1=False)
-        respond = self._writer(f"rr{service}Reply", f"{kind}Response_", quality)
-
-        def take(request: bytes) -> None:
-            identity = request[_HEADER_BYTES : _HEADER_BYTES + _IDENTITY_BYTES]
-
-            def reply(done: Future[Answer]) -> None:
-                response = codec.encode(codec.make(TRIGGER_RESPONSE, **done.result()._asdict()), TRIGGER_RESPONSE)
-                respond(response[:_HEADER_BYTES] + identity + response[_HEADER_BYTES:])
-
-            asked = act()
-            if len(identity) == _IDENTITY_BYTES:
-                asked.add_done_callback(reply)
-
-        self._read(f"rq{service}Request", f"{kind}Request_", quality, take)
-
-    def close(self) -> None:
-        """As in RosNetwork."""
-        self._closed.set()
-        self._thread.join()
-
-    def _read(self, topic: str, dds_kind: str, quality: Quality, deliver: Deliver) -> None:
         from cyclonedds.core import Policy, ReadCondition
         from cyclonedds.sub import DataReader
 
         asked = _qos(quality, Policy.IgnoreLocal.Participant)
-        reader = DataReader(self._participant, self._topic(topic, dds_kind), asked)
+        reader = DataReader(self._participant, self._topic(topic, kind), asked)
         self._readers = (*self._readers, (reader, deliver))
         self._waitset.attach(ReadCondition(reader, self._any))
 
-    def _writer(self, topic: str, dds_kind: str, quality: Quality) -> Publish:
+    def publisher(self, topic: str, kind: str, quality: Quality) -> Publish:
+        """As in RosNetwork."""
         from cyclonedds.core import DDSException
         from cyclonedds.pub import DataWriter
 
-        writer = DataWriter(self._participant, self._topic(topic, dds_kind), _qos(quality))
-        message = raw_type(dds_kind)
+        writer = DataWriter(self._participant, self._topic(topic, kind), _qos(quality))
+        message = raw_type(dds_type(kind))
 
         def publish(payload: bytes) -> None:
             try:
@@ -147,12 +111,17 @@ class Ros2Network:
 
         return publish
 
-    def _topic(self, name: str, dds_kind: str) -> Any:
+    def close(self) -> None:
+        """As in RosNetwork."""
+        self._closed.set()
+        self._thread.join()
+
+    def _topic(self, name: str, kind: str) -> Any:
         from cyclonedds.topic import Topic
 
-        if (name, dds_kind) not in self._topics:
-            self._topics[name, dds_kind] = Topic(self._participant, name, raw_type(dds_kind))
-        return self._topics[name, dds_kind]
+        if (name, kind) not in self._topics:
+            self._topics[name, kind] = Topic(self._participant, f"rt{name}", raw_type(dds_type(kind)))
+        return self._topics[name, kind]
 
     def _receive(self) -> None:
         while not self._closed.is_set():
@@ -249,10 +218,10 @@ def _quality_of(qos: Any) -> Quality:
     return Quality(reliable, latched)
 
 
-def dds_type(kind: str, group: str = "msg") -> str:
+def dds_type(kind: str) -> str:
     """The name of a type, as in ``sensor_msgs::msg::dds_::LaserScan_`` of ``sensor_msgs/LaserScan``."""
     package, name = kind.split("/")
-    return f"{package}::{group}::dds_::{name}_"
+    return f"{package}::msg::dds_::{name}_"
 
 
 def kind_of(dds_type: str) -> str | None:

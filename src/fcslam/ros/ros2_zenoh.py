@@ -11,13 +11,12 @@ import struct
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
 from typing import Any, Final
 
 from fcslam.errors import InputError
-from fcslam.ros.network import TRIGGER, Act, Answer, Deliver, Endpoint, Publish, Quality
+from fcslam.ros.network import Deliver, Endpoint, Publish, Quality
 from fcslam.ros.ros2 import dds_type, kind_of
-from fcslam.sources.bags.codec import TRIGGER_RESPONSE, MessageCodec, full_name
+from fcslam.sources.bags.codec import MessageCodec, full_name
 
 INSTALL: Final = "pip install 'fcslam[zenoh]'"
 ROUTER: Final = "tcp/localhost:7447"
@@ -30,7 +29,6 @@ _SETTINGS: Final = {
     "timestamping/enabled": "true",
 }
 """These are also the values of rmw_zenoh's own session configuration."""
-_TRIGGER_HASH: Final = "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
 _ADMIN, _NODE = "@ros2_lv", 0
 _KINDS: Final = {"MP": True, "MS": False}
 """Whether an endpoint publishes, by its name in a token."""
@@ -103,7 +101,7 @@ class ZenohNetwork:
             )
         else:
             self._declare(self._session.declare_subscriber(key, take, allowed_origin=remote))
-        self._show("MS", topic, dds_type(kind), self._hash(kind), quality)
+        self._show("MS", topic, kind, quality)
 
     def publisher(self, topic: str, kind: str, quality: Quality) -> Publish:
         """As in RosNetwork."""
@@ -124,7 +122,7 @@ class ZenohNetwork:
         else:
             publisher = self._session.declare_publisher(key, **options)
         self._declare(publisher)
-        sender = self._show("MP", topic, dds_type(kind), self._hash(kind), quality)
+        sender = self._show("MP", topic, kind, quality)
         numbers = itertools.count(1)
 
         def publish(payload: bytes) -> None:
@@ -135,30 +133,6 @@ class ZenohNetwork:
 
         return publish
 
-    def serve(self, service: str, act: Act) -> None:
-        """As in RosNetwork."""
-        kind = dds_type(TRIGGER, "srv")
-        key = f"{self._domain}/{service.strip('/')}/{kind}/{_TRIGGER_HASH}"
-
-        def take(query: Any) -> None:
-            number, sender = _identity(query.attachment)
-
-            def reply(done: Future[Answer]) -> None:
-                response = self._codec.make(TRIGGER_RESPONSE, **done.result()._asdict())
-                try:
-                    query.reply(
-                        key,
-                        self._codec.encode(response, TRIGGER_RESPONSE),
-                        attachment=attachment(number, time.time_ns(), sender),
-                    )
-                finally:
-                    query.drop()  # ends the wait of the caller
-
-            act().add_done_callback(reply)
-
-        self._declare(self._session.declare_queryable(key, take, complete=True))
-        self._show("SS", service, kind, _TRIGGER_HASH, Quality(reliable=True))
-
     def close(self) -> None:
         """As in RosNetwork."""
         for declared in reversed(self._declared):
@@ -168,9 +142,9 @@ class ZenohNetwork:
     def _declare(self, declared: Any) -> None:
         self._declared.append(declared)
 
-    def _show(self, kind: str, topic: str, dds_kind: str, type_hash: str, quality: Quality) -> bytes:
-        words = (topic.replace("/", "%"), dds_kind, type_hash, quality_text(quality))
-        token = "/".join((self._token(next(self._numbers), kind), *words))
+    def _show(self, endpoint: str, topic: str, kind: str, quality: Quality) -> bytes:
+        words = (topic.replace("/", "%"), dds_type(kind), self._hash(kind), quality_text(quality))
+        token = "/".join((self._token(next(self._numbers), endpoint), *words))
         self._declare(self._session.liveliness().declare_token(token))
         return hashlib.blake2b(token.encode(), digest_size=16).digest()
 
@@ -246,14 +220,6 @@ def endpoint_of(token: str, own: str) -> Endpoint | None:
     reliability, durability, *_ = f"{parts[12]}:".split(":")
     quality = Quality(reliability in ("", _RELIABLE), durability == _LATCHED)
     return Endpoint(parts[9].replace("%", "/"), kind, _KINDS[parts[5]], quality, parts[2] == own)
-
-
-def _identity(attached: Any) -> tuple[int, bytes]:
-    data = b"" if attached is None else attached.to_bytes()
-    if len(data) != struct.calcsize("<qqB16s"):
-        return 0, bytes(16)
-    number, _, _, sender = struct.unpack("<qqB16s", data)
-    return number, sender
 
 
 def _first_line(error: Exception) -> str:

@@ -25,12 +25,9 @@ OLD_TRANSFORMS = "tf/tfMessage"
 """The name of TRANSFORMS in early ROS 1."""
 GRID_UPDATE = "map_msgs/OccupancyGridUpdate"
 """A part of an occupancy grid; rosbags does not know this type."""
-TRIGGER_RESPONSE = "std_srvs/Trigger_Response"
-"""The response of a service of the type std_srvs/Trigger; rosbags has no types of services."""
 
 _NANOSECONDS = 10**9
 _GRID_UPDATE_FIELDS = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data"
-_TRIGGER_RESPONSE_FIELDS = "bool success\nstring message"
 _LIVOX_FIELDS = """std_msgs/Header header
 uint64 timebase
 uint32 point_num
@@ -143,7 +140,6 @@ def typestore(ros1: bool) -> "Typestore":
     if ros1:
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", full_name(TRANSFORMS)))
     store.register(get_types_from_msg(_GRID_UPDATE_FIELDS, full_name(GRID_UPDATE)))
-    store.register(get_types_from_msg(_TRIGGER_RESPONSE_FIELDS, full_name(TRIGGER_RESPONSE)))
     for kind in LIVOX_CLOUDS:
         store.register(get_types_from_msg(_LIVOX_FIELDS.format(package=kind.partition("/")[0]), full_name(kind)))
     return store
