@@ -7,8 +7,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.records import Sweep
-from fcslam.sources.motion import OdometryBridge, OdometryUpdates, moving_sweep
-from fcslam.sources.pose import relative_pose
+from fcslam.sources.motion import OdometryUpdates, moving_sweep
 
 
 class Reading(NamedTuple):
@@ -63,24 +62,3 @@ def test_readings_at_rest_and_at_every_update_are_fresh():
     moving = [(0.02 * k, (0.01 * k, 0.0, 0.0)) for k in range(50)]
     resting = [(1.0 + 0.02 * k, (0.5, 0.0, 0.0)) for k in range(100)]
     assert all(updates.is_fresh(*reading) for reading in moving + resting)
-
-
-def bridged(readings):
-    bridge = OdometryBridge()
-    return [bridge.bridged(stamp, pose) for stamp, pose in readings]
-
-
-@pytest.mark.parametrize("pose", [(1.6, 0.4, 0.3), (0.3, -0.2, 3.0), (40.0, 2.0, -1.0)])
-def test_odometry_that_starts_at_zero_again_goes_on(pose):
-    after = (0.01, 0.0, 0.0)
-    poses = bridged([(0.0, pose), (9.98, pose), (10.0, (0.0, 0.0, 0.0)), (10.02, after)])
-    assert [is_jump for _, is_jump in poses] == [False, False, True, False]
-    np.testing.assert_allclose(poses[2][0], pose, atol=1e-9)
-    np.testing.assert_allclose(relative_pose(poses[2][0], poses[3][0]), after, atol=1e-9)
-
-
-def test_fast_robots_and_late_readings_are_no_jumps():
-    car = [(0.02 * n, (min(20.0, 0.1 * n) * 0.02 * n, 0.0, 0.0)) for n in range(400)]
-    assert bridged(car) == [(pose, False) for _, pose in car]
-    rare = [(0.0, (0.0, 0.0, 0.0)), (0.0, (0.8, 0.0, 0.0)), (2.0, (3.0, 0.0, 1.5)), (1.9, (0.0, 0.0, 0.0))]
-    assert bridged(rare) == [(pose, False) for _, pose in rare]

@@ -18,6 +18,7 @@ from fcslam.lidar.own_body import body_sectors
 from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.predicted_motion import PREDICTED, MotionPrediction
+from fcslam.robot.wheel_odometry import is_jump
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.contradictions import RepeatedScans
@@ -26,6 +27,8 @@ from fcslam.sources.pose import pose_of
 from fcslam.sources.returns import FloorLine
 from fcslam.sources.source import Noted, Source
 
+MOST_JUMPS: Final = 10
+"""Odometry that jumps more often is wrong."""
 MOST_SCANS: Final = 1200
 """Scans that are tracked at most."""
 ENOUGH_TURN_RAD: Final = 40.0
@@ -321,7 +324,12 @@ def _track_of(odometry: list[Odometry]) -> OdometryTrack | None:
     grows = max(after_all, before_all, key=np.count_nonzero)
     poses = np.array([reading.T_odom_base for reading in fresh])
     period_s = max(updates.period_s, float(np.median(np.diff(stamps[grows]))) if grows.sum() > 1 else 0.0)
-    return OdometryTrack(stamps[grows], _unwrapped(poses[grows]), period_s)
+    stamps, poses = stamps[grows], poses[grows]
+    steps = se2.between(poses[:-1], poses[1:]).tolist()
+    jumps = [at for at, step in enumerate(steps, 1) if is_jump(step, stamps[at] - stamps[at - 1])]
+    for at in jumps if len(jumps) <= MOST_JUMPS else ():  # odometry that begins again goes on from where it was
+        poses[at:] = se2.compose(poses[at - 1], se2.between(poses[at], poses[at:]))
+    return OdometryTrack(stamps, _unwrapped(poses), period_s)
 
 
 def _unwrapped(poses: FloatArray) -> FloatArray:

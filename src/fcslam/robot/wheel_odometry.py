@@ -64,7 +64,7 @@ class WheelOdometry:
                 read = se2.compose(before, self._motion)
             x, y, turn = motion = se2.motion(before, read)
             moved_m = math.hypot(x, y)
-            if _is_jump(moved_m, abs(turn), scan.stamp - stamp):
+            if is_jump(motion, scan.stamp - stamp):
                 self.jumps += 1
                 self.largest_m = max(self.largest_m, moved_m)
                 self._bridge = se2.compose(se2.compose(self.bridged(before), self._motion), se2.inverse(read))
@@ -99,9 +99,11 @@ class WheelOdometry:
         return T_odom_base if self._bridge is None else se2.compose(self._bridge, T_odom_base)
 
 
-def _is_jump(moved_m: float, turned_rad: float, within_s: float) -> bool:
+def is_jump(motion: se2.Pose, within_s: float) -> bool:
+    """Whether no robot moves so far within a time."""
     within_s = within_s if within_s > 0.0 else WITHOUT_CLOCK_S
-    return moved_m > SLACK_M + LARGEST_SPEED_M_S * within_s or turned_rad > SLACK_RAD + LARGEST_TURN_RAD_S * within_s
+    (x, y, turn), reach_m = motion, SLACK_M + LARGEST_SPEED_M_S * within_s
+    return math.hypot(x, y) > reach_m or abs(turn) > SLACK_RAD + LARGEST_TURN_RAD_S * within_s
 
 
 class WheelCheck:

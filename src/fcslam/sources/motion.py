@@ -8,7 +8,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.records import FloatArray, Sweep
-from fcslam.sources.pose import Pose, composed_pose, relative_pose
+from fcslam.sources.pose import Pose, relative_pose
 
 SAMPLES: Final = 9
 """Poses by odometry that the motion during a sweep is fitted to."""
@@ -26,16 +26,6 @@ LONGEST_UPDATE_S: Final = 0.35
 """A robot whose odometry does not change for longer stands still."""
 LEAST_STEP_M, LEAST_STEP_RAD = 0.005, 0.005
 """A smaller change is that of an encoder at a low speed."""
-
-
-JUMP_M, JUMP_RAD = 0.3, 0.5
-"""A step that is not longer is not a jump: stamps may be wrong, and scan matching corrects it."""
-LEAST_SPEED_M_S, LEAST_TURN_RAD_S = 5.0, 6.0
-"""Speeds that any robot may seem to reach between two readings, as their stamps may be wrong."""
-FASTER: Final = 2.0
-"""Largest ratio of the speed of a robot to its recent speed."""
-FORGOTTEN: Final = 0.98
-"""Share of a speed that counts at the next reading."""
 
 
 class Reading(Protocol):
@@ -88,51 +78,6 @@ class OdometryUpdates:
                     self._longest_s = max(self._longest_s, held_s)
         self._update, self._repeats = (stamp, T_odom_base), 0
         return True
-
-
-class OdometryBridge:
-    """Moves the frame ``odom`` where the odometry jumps, as when its driver restarts at zero.
-
-    A step is a jump if it is faster than the robot was lately, by far. Within it the robot is taken to stand still;
-    scan matching finds its motion.
-    """
-
-    def __init__(self) -> None:
-        self._last: tuple[float, Pose] | None = None
-        """The reading before, as it was read."""
-        self._changed_s = 0.0
-        """Stamp of the newest reading that differs from the one before."""
-        self._speed_m_s, self._turn_rad_s = 0.0, 0.0
-        """Recent speed and turn rate of the robot."""
-        self._T_first_odom: Pose | None = None
-        """The present frame in the first one; None before the first jump."""
-
-    def bridged(self, stamp: float, T_odom_base: Pose) -> tuple[Pose, bool]:
-        """The next reading in the first frame ``odom``, and whether a jump leads to it."""
-        last, self._last = self._last, (stamp, T_odom_base)
-        is_jump = False
-        if last is None:
-            self._changed_s = stamp
-        elif T_odom_base != last[1]:
-            held_s, self._changed_s = stamp - self._changed_s, stamp
-            elapsed_s = held_s if held_s <= LONGEST_UPDATE_S else stamp - last[0]
-            is_jump = elapsed_s > 0.0 and self._is_jump(relative_pose(last[1], T_odom_base), elapsed_s)
-            if is_jump:
-                self._T_first_odom = composed_pose(self._moved(last[1]), relative_pose(T_odom_base, (0.0, 0.0, 0.0)))
-        return self._moved(T_odom_base), is_jump
-
-    def _moved(self, T_odom_base: Pose) -> Pose:
-        return T_odom_base if self._T_first_odom is None else composed_pose(self._T_first_odom, T_odom_base)
-
-    def _is_jump(self, step: Pose, elapsed_s: float) -> bool:
-        length_m, turn_rad = hypot(step[0], step[1]), abs(step[2])
-        fastest_m_s = max(FASTER * self._speed_m_s, LEAST_SPEED_M_S)
-        fastest_rad_s = max(FASTER * self._turn_rad_s, LEAST_TURN_RAD_S)
-        if length_m > JUMP_M + fastest_m_s * elapsed_s or turn_rad > JUMP_RAD + fastest_rad_s * elapsed_s:
-            return True
-        self._speed_m_s = max(FORGOTTEN * self._speed_m_s, min(length_m / elapsed_s, fastest_m_s))
-        self._turn_rad_s = max(FORGOTTEN * self._turn_rad_s, min(turn_rad / elapsed_s, fastest_rad_s))
-        return False
 
 
 class _Track(NamedTuple):

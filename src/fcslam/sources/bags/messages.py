@@ -60,8 +60,6 @@ class OdometryReading(NamedTuple):
     T_odom_base: Pose
     base_frame: str
     odom_frame: str
-    is_after_jump: bool = False
-    """Whether the odometry jumped since the reading before."""
 
 
 class StampedTransform(NamedTuple):

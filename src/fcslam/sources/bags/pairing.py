@@ -7,8 +7,7 @@ nearest in the recording, not in time, so that a step back of the clock does not
 An image whose clock is ahead would hold the scans behind it. So once such a scan has its pose, the image waits no
 longer and gets the nearest pose.
 
-Odometry that jumps goes on as before the jump. A reading that was recorded a little late, after one with a later stamp,
-counts at its time.
+A reading that was recorded a little late, after one with a later stamp, counts at its time.
 
 Before the first and after the last reading, and where the odometry's clock steps back, a scan gets the pose of the
 nearest reading within 1 s, or none.
@@ -25,7 +24,7 @@ from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import ScanGate
-from fcslam.sources.motion import OdometryBridge, OdometryUpdates, moving_sweep
+from fcslam.sources.motion import OdometryUpdates, moving_sweep
 from fcslam.sources.pose import UNKNOWN_POSE, Pose, interpolated_pose
 
 MAX_GAP_S = 1.0
@@ -81,7 +80,7 @@ class OdometryPairing:
     def __init__(self) -> None:
         self._readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
         self._queue: deque[_QueuedItem] = deque()
-        self._bridge, self._updates = OdometryBridge(), OdometryUpdates()
+        self._updates = OdometryUpdates()
         self._late = 0
         """Newest readings in a row that are earlier than the newest one in time."""
         self.images_ahead_s = 0.0
@@ -96,8 +95,6 @@ class OdometryPairing:
         """Add the next item; yields those that wait no longer, in their order."""
         readings, queue = self._readings, self._queue
         if isinstance(item, OdometryReading):
-            T_odom_base, is_after_jump = self._bridge.bridged(item.stamp, item.T_odom_base)
-            item = item._replace(T_odom_base=T_odom_base, is_after_jump=is_after_jump)
             if self._is_late(item.stamp):
                 _insert(readings, item)
             elif self._updates.is_fresh(item.stamp, item.T_odom_base):
@@ -161,8 +158,6 @@ class EntryGate:
 
     def admits(self, number: int, entry: Entry) -> bool:
         """Whether the entry of message ``number`` is consistent; a scan without odometry is not."""
-        if isinstance(entry, OdometryReading) and entry.is_after_jump:
-            self._audit.add(Fault.ODOMETRY_JUMP, number)
         if not isinstance(entry, PosedScan):
             return True
         if not self._gates[entry.scan.laser].admits(number, entry.scan.stamp, entry.scan.beams):

@@ -39,7 +39,7 @@ from fcslam.sources.bags.transforms import USUAL_BASES, Mounting
 from fcslam.sources.contradictions import Alternation, ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
-from fcslam.sources.path_summary import FEWEST_POSES, PathSummary, check_units
+from fcslam.sources.path_summary import PathSummary, check_units
 from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample, CloudBand
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -47,8 +47,6 @@ from fcslam.sources.source import WHOLE, ScanRange, Survey
 _audit = partial(Audit, "message")
 _EACH_LASER = "give one for each laser, in the same order"
 
-_MOST_JUMPS = 0.2
-"""Share of the readings of odometry at which it may jump."""
 _OF_SCANS = "its range_min and range_max"
 _OF_CLOUDS = "that its points are in metres, its mounting in tf and the heights of --sensors cloud-band"
 
@@ -315,12 +313,7 @@ class RosBag:
                 "odom-topic=none"
             )
         check_units(path, scans)
-        jumps, source = faults[Fault.ODOMETRY_JUMP].count, self.plan.odometry
-        if source is not None and jumps > max(_MOST_JUMPS * odometry.count, FEWEST_POSES):
-            raise SourceError(
-                f"{path}: {source.name} jumps at {jumps} of {odometry.count} readings, as if there were two "
-                "publishers or another unit; choose another one by --sensors odom-topic, or none to map without"
-            )
+        source = self.plan.odometry
         if source is not None and (spins := odometry.spins) is not None:
             raise SourceError(
                 f"{path}: {source.name} {spins}, as if in degrees, or of two robots; publish a quaternion made from "
