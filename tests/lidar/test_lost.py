@@ -17,7 +17,7 @@ from fcslam.lidar.lost import (
     is_doubtful,
     is_lost,
 )
-from fcslam.lidar.odometry import OdometryTrust
+from fcslam.lidar.odometry import WHEELS, OdometryTrust
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import LaserModel, frozen
 from fcslam.robot.frontend import RobotFrontend
@@ -59,10 +59,6 @@ def elsewhere():
     return recording(poses, poses, room())
 
 
-def judged(frontend, scans):
-    return is_lost(scans, frontend)
-
-
 def test_looking_leaves_no_trace(around):
     looked, plain = mapped(around[:80]), mapped(around[:80])
     for scan in around[80:90]:
@@ -79,7 +75,7 @@ def test_scans_of_one_drive_are_hardly_doubted_and_never_lost(around):
     for k in range(60, len(around) - 20):
         doubts.append(is_doubtful(frontend.localize(around[k]), frontend, CONFIG))
         if k % 25 == 0:
-            assert not judged(frontend, around[k : k + 15])
+            assert not is_lost(around[k : k + 15], frontend)
         frontend.process(around[k])
     assert np.mean(doubts) < 0.02
 
@@ -88,13 +84,10 @@ def test_another_place_is_doubted_and_lost(around, elsewhere):
     before = around[:120]
     frontend, there = mapped(before), moved_on(elsewhere, before)
     assert is_doubtful(frontend.localize(there[0]), frontend, CONFIG)
-    assert judged(frontend, there[:20])
+    assert is_lost(there[:20], frontend)
 
 
-def trusting(scans):
-    frontend = mapped(scans)
-    frontend._tracker._trust = OdometryTrust(0.2, 0.2, 200)
-    return frontend
+RIGHT = OdometryTrust(0.2, 0.2, 200)
 
 
 def last_of(scans):
@@ -103,41 +96,32 @@ def last_of(scans):
 
 def test_who_drove_on_did_so_by_trusted_odometry_and_by_what_is_seen(around, elsewhere):
     before = around[:60]
-    assert drove_on(last_of(before), around[60:62], trusting(before))
-    assert not drove_on(last_of(before), around[60:62], mapped(before[:2])), "nothing is known about odometry"
-    assert not drove_on(last_of(before), moved_on(elsewhere, before)[:8], trusting(before))
+    assert drove_on(last_of(before), around[60:62], WHEELS, RIGHT)
+    assert not drove_on(last_of(before), around[60:62], WHEELS, OdometryTrust()), "nothing is known about odometry"
+    assert not drove_on(last_of(before), moved_on(elsewhere, before)[:8], WHEELS, RIGHT)
 
 
 def test_one_scan_that_fits_is_enough_for_a_robot_that_drove_over_a_bump(around, elsewhere):
     before = around[:60]
     bump = replace(around[60], ranges_m=moved_on(elsewhere, before)[0].ranges_m)
-    assert not drove_on(last_of(before), [bump], trusting(before))
-    assert drove_on(last_of(before), [bump, around[61]], trusting(before))
+    assert not drove_on(last_of(before), [bump], WHEELS, RIGHT)
+    assert drove_on(last_of(before), [bump, around[61]], WHEELS, RIGHT)
 
 
-def test_odometry_worse_than_its_model_ties_nothing(around):
-    frontend = trusting(around[:60])
-    frontend._tracker._trust = OdometryTrust(1.5, 0.5, 200)
-    assert not drove_on(last_of(around[:60]), around[60:62], frontend)
+@pytest.mark.parametrize(("odometry", "trust"), [(WHEELS, OdometryTrust(1.5, 0.5, 200)), (PREDICTED, RIGHT)], ids=str)
+def test_odometry_worse_than_its_model_and_a_prediction_tie_nothing(around, odometry, trust):
+    assert not drove_on(last_of(around[:60]), around[60:62], odometry, trust)
 
 
 @pytest.mark.parametrize("farther_m", [3.0, 0.3])
 def test_scans_that_share_little_or_disagree_do_not_show_one_place(around, farther_m):
     changed = np.arange(len(around[60].ranges_m)) % 3 > 0
     now = replace(around[60], ranges_m=frozen(around[60].ranges_m + farther_m * changed, np.float32))
-    assert not drove_on(last_of(around[:60]), [now], trusting(around[:60]))
-
-
-def test_a_robot_without_wheels_never_drove_on_by_odometry(around):
-    frontend = LidarFrontend("r", LidarConfig(), PREDICTED)
-    for scan in around[:60]:
-        frontend.process(scan)
-    frontend._tracker._trust = OdometryTrust(0.5, 0.5, 200)
-    assert not drove_on(last_of(around[:60]), around[60:62], frontend)
+    assert not drove_on(last_of(around[:60]), [now], WHEELS, RIGHT)
 
 
 def test_another_local_map_is_tied_to_the_past_by_odometry_alone(around):
-    frontend = trusting(around[:60])
+    frontend = mapped(around[:60])
     past_m = frontend.travel_m
     frontend.begin_local_map()
     assert frontend.settled_m == 0.0
@@ -153,7 +137,7 @@ def test_scans_that_do_not_explain_one_another_tell_nothing(around, elsewhere):
     frontend, there = mapped(before), moved_on(elsewhere, before)
     rng = np.random.default_rng(0)
     torn = [replace(s, ranges_m=frozen(s.ranges_m * rng.uniform(0.5, 1.0, len(s.ranges_m)), np.float32)) for s in there]
-    assert not judged(frontend, torn[:20])
+    assert not is_lost(torn[:20], frontend)
 
 
 def test_a_box_that_was_not_there_before_makes_nobody_lost(around):
@@ -161,7 +145,7 @@ def test_a_box_that_was_not_there_before_makes_nobody_lost(around):
     changed = recording(poses, poses, np.vstack((ring(), box(13.6, 6.0, 14.1, 6.5))))
     before = 120
     frontend = mapped(around[:before])
-    assert not judged(frontend, changed[before : before + 20])
+    assert not is_lost(changed[before : before + 20], frontend)
 
 
 def test_who_has_hardly_moved_cannot_be_lost(around, elsewhere):

@@ -33,7 +33,8 @@ def track(scans):
     tracker = ScanTracker(WHEELS)
     poses, last = [], None
     for scan in scans:
-        tracked = tracker.track(scan)
+        tracker.commit(result := tracker.localize(scan))
+        tracked = result.tracked
         poses.append(tracked.T_local_base)
         motion = np.full(3, np.inf) if last is None else se2.between(last, tracked.T_local_base)
         if tracked.scan is not None and (np.hypot(motion[0], motion[1]) > KEYSCAN_M or abs(motion[2]) > KEYSCAN_RAD):

@@ -172,7 +172,6 @@ def _json(content: object) -> bytes:
 
 
 def _picture(plan: OccupancyMap, maps: Sequence[OccupancyMap]) -> bytes:
-    """The plan and the maps that lie in it, laid on each other."""
     side = maps[0].resolution_m if maps else max(plan.resolution_m, 0.05)
     lows = [np.array(one.origin_xy) for one in (plan, *maps)]
     highs = [

@@ -80,8 +80,6 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Wall:
-    """Points of one straight wall."""
-
     points: FloatArray
     normals: FloatArray
     off_m: float | None
@@ -161,7 +159,6 @@ def _across(points: FloatArray, normals: FloatArray, field: SurfelField) -> Floa
 
 
 def _distance(points: FloatArray, other: Submap) -> FloatArray:
-    """Distance of each point (N, 2) from the nearest surface of the other map."""
     if not len(other.field.points):
         return np.full(len(points), np.inf)
     return np.asarray(cKDTree(other.field.points).query(points)[0])
@@ -198,7 +195,6 @@ def _walls(points: FloatArray, normals: FloatArray, across: FloatArray, chosen: 
 
 
 def _moved(wall: _Wall, others: Sequence[_Wall], farthest_m: float) -> tuple[int, float] | None:
-    """The nearest of other walls that stands beside a wall, parallel to it, and how far it is; None if none does."""
     normal = wall.normal
     tangent = np.array((-normal[1], normal[0]))
     first, last = wall.along(tangent)

@@ -56,8 +56,6 @@ class Georeference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Measured:
-    """Fixes at keyscans, N of them."""
-
     variables: NDArray[np.int64]
     arms: FloatArray
     """The antenna in the base of the keyscan, shape (N, 2)."""
@@ -162,7 +160,6 @@ def _refusal(measured: _Measured, agreeing: NDArray[np.bool_]) -> str:
 def _solve(
     graph: PoseGraph, poses: FloatArray, measured: _Measured, agreeing: NDArray[np.bool_]
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Alternate solving with the fixes that agree, and deciding which ones do."""
     for _ in range(ROUNDS):
         arms = measured.antennas(poses) - poses[measured.variables, :2]
         priors = [

@@ -82,7 +82,6 @@ def fit_to_plan(plan: BuildingPlan, part: MapPart, T_plan_map: FloatArray) -> tu
 
 
 def _scaled(robot: MappedRobot, scale: float) -> MappedRobot:
-    """The robot with its ranges and its own map in another scale."""
     if scale == 1.0:
         return robot
     lengths = np.array((scale, scale, 1.0))
@@ -100,7 +99,6 @@ def _scaled(robot: MappedRobot, scale: float) -> MappedRobot:
 def _priors(
     plan: BuildingPlan, scans: Sequence[tuple[int, PointScan]], poses: FloatArray, wide_scale_m: float
 ) -> list[PosePrior]:
-    """The poses of scans by the walls of the plan that they see."""
     priors = []
     for variable, scan in scans:
         found = match_scan(scan, plan.submap.field, poses[variable], np.zeros((3, 3)), wide_scale_m=wide_scale_m)

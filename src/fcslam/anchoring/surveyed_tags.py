@@ -50,8 +50,6 @@ Survey = Mapping[Tag, tuple[float, float, float | None]]
 
 
 class _Surveyed(StrictModel):
-    """Where a tag is, metres, and the direction that it faces, radians."""
-
     x: float
     y: float
     yaw: float | None = None
@@ -79,8 +77,6 @@ def read_survey(path: Path) -> Survey:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Place:
-    """A place where a tag was seen."""
-
     pose: FloatArray
     """Shape (3,), weighted mean of its sightings."""
     sightings: tuple[TagSighting, ...]

@@ -74,8 +74,6 @@ class Chains:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
-    """One edge of each chain that is long enough."""
-
     chains: NDArray[np.int64]
     """Shape (K,)."""
     j: NDArray[np.int64]

@@ -68,7 +68,6 @@ class FactorCache:
         poses[... if rows is None else rows] = from_values(values)
 
     def _rows(self, solved: NDArray[np.bool_] | None) -> NDArray[np.int64] | None:
-        """Variables that the factors measure; None: all."""
         if solved is not None:
             return np.flatnonzero(solved)
         return None if self.chains is None else self.chains.kept
@@ -153,7 +152,6 @@ class FactorCache:
             graph.push_back(gtsam.PriorFactorPose2(variable, gtsam.Pose2(*poses[variable].tolist()), noise))
 
     def _update(self) -> None:
-        """Build the factors of new trusted edges."""
         edges = self.graph.arrays()
         new = np.arange(self._built, len(edges.i))
         trusted = new[~edges.robust[new]]
@@ -164,7 +162,6 @@ class FactorCache:
     def _add_trusted(
         self, i: NDArray[np.int64], j: NDArray[np.int64], T_i_j: FloatArray, information: FloatArray
     ) -> None:
-        """Add trusted motions, shapes (K,), (K,), (K, 3) and (K, 3, 3)."""
         roots = _roots(information)
         for first, last, motion, root in zip(i.tolist(), j.tolist(), T_i_j.tolist(), roots, strict=True):
             self._trusted.push_back(_between(first, last, gtsam.Pose2(*motion), _gaussian(root)))
@@ -199,5 +196,4 @@ def _under(loss: Loss, noise: Any) -> Any:
 
 
 def _roots(information: FloatArray) -> FloatArray:
-    """Upper triangular roots of information matrices, shape (K, 3, 3)."""
     return np.asarray(np.linalg.cholesky(information).transpose(0, 2, 1), dtype=np.float64)

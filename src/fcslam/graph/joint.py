@@ -191,7 +191,6 @@ def _solve_own_graph(
     initial: FloatArray,
     factors: FactorCache,
 ) -> tuple[Trajectory, NDArray[np.int64]]:
-    """Trajectory of one robot from its own measurements and initial poses, and those of its edges that are inliers."""
     graph = evidence.graph
     number = np.full(len(graph), -1)
     number[robot] = np.arange(len(robot))
@@ -208,7 +207,6 @@ def _solve_own_graph(
 def _find_links(
     evidence: JointEvidence, own: Sequence[Trajectory], settings: ConsistencySettings, examine: ExaminePair
 ) -> list[Link]:
-    """Pairwise consistency for every two robots (PCM), on their own trajectories."""
     links = []
     for a, b, rows, closures in _pairs(evidence, evidence.independent & ~evidence.excluded):
         examine_members = partial(_examine, examine, (a, b), own, closures)

@@ -161,8 +161,6 @@ def refine_inliers(
 
 
 class _Steps:
-    """State of a solve in steps: present poses (N, 3), and iterations so far."""
-
     def __init__(self, cache: FactorCache, poses: FloatArray) -> None:
         self.cache, self.poses, self.iterations = cache, poses.copy(), 0
         self._values = cache.values(poses)
@@ -185,7 +183,6 @@ class _Steps:
 
 
 def _graduate(steps: _Steps) -> None:
-    """Sharpen the loss from almost squared to truncated, with few iterations per step."""
     chi2 = steps.chi2()
     largest = chi2.max(initial=0.0)
     if largest <= CHI2_LIMIT:
@@ -234,7 +231,6 @@ def _truncated(chi2: FloatArray, robust: ArrayLike) -> float:
 
 
 def _levenberg_marquardt(problem: Any, values: Any, iterations: int) -> tuple[Any, int]:
-    """Run GTSAM's solver; returns the values and the number of iterations."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)
     parameters.setRelativeErrorTol(_TOLERANCE)

@@ -170,7 +170,6 @@ def _first_connected(i, j, count):  # type: ignore[no-untyped-def]
 
 @njit(allocates=False)
 def _root(first, variable):  # type: ignore[no-untyped-def]
-    """The root of a variable; the path to it is halved."""
     while first[variable] != variable:
         first[variable] = first[first[variable]]
         variable = first[variable]
@@ -183,8 +182,6 @@ def anchors(components: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class _EdgeRows(Sequence[Edge]):
-    """Edges as rows of arrays."""
-
     def __init__(self, edges: EdgeArrays) -> None:
         """``edges`` with the information that was given."""
         self._i, self._j, self._robust = Rows(edges.i), Rows(edges.j), Rows(edges.robust)

@@ -93,7 +93,6 @@ class LidarBackend:
         return se2.compose(poses[before], se2.between(local[anchors[before]], local))
 
     def _finish_submap(self, at_end: bool = False) -> FinishedSubmap | None:
-        """Build the next submap once the robot is far enough past its anchor, and close loops to earlier ones."""
         gate, window = self._gate, self._window
         travel = [keyscan.travel_m for keyscan in window]
         middle = bisect_left(travel, self._next_anchor_m)
@@ -114,7 +113,6 @@ class LidarBackend:
         return FinishedSubmap(number, *ends, submap.surface.points, closures)
 
     def _add_anchor(self, anchor: MappedKeyscan) -> None:
-        """Add a variable to the pose graph, with a constraint to the anchor before it."""
         if not self._closer.submaps:
             self._poses = anchor.T_odom_base[None]
             self._graph.add_variable(anchor.T_odom_base)
@@ -128,7 +126,6 @@ class LidarBackend:
         self._poses = np.vstack((self._poses, pose))
 
     def _close_loops(self, anchored: AnchoredSubmap, submap: Submap) -> tuple[Constraint, ...]:
-        """Compare a new submap with earlier ones; accepted closures become constraints."""
         closures = self._closer.add(anchored, submap, self._poses)
         for c in closures:
             self._graph.add_edge(Edge(c.earlier, c.later, c.check.T_a_b, c.check.information, robust=True))

@@ -182,8 +182,6 @@ def _sweep_share(motions: ScanMotions, odometry: OdometryTrack, delay_s: float) 
 
 
 class _Fit(NamedTuple):
-    """The scale and the mounting with which one kind of motion gives the other."""
-
     scale: Estimate
     mounting: tuple[Estimate, Estimate, Estimate]
     residual_m: float

@@ -20,11 +20,9 @@ from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
 from fcslam.lidar.correlative import SearchWindow, search
 from fcslam.lidar.submap import Submap, read_submap, submap_bytes
-from fcslam.lidar.verification import VERIFICATION, Verification, verify
+from fcslam.lidar.verification import SYMMETRY_M, SYMMETRY_RAD, VERIFICATION, Verification, verify
 from fcslam.records import FloatArray
 
-SURPRISE_M, SURPRISE_RAD = 0.15, 0.03
-"""A closure farther than this from its prediction contradicts the estimate, and the graph is solved at once."""
 NARROW_M = 0.8
 """Up to this drift allowance the prediction itself starts the alignment, and the loose gate is enough."""
 DISTANCE_PENALTY, ANGLE_PENALTY = 0.2, 0.1
@@ -37,7 +35,7 @@ PENDING_M = 60.0
 
 BASE_DRIFT_M, BASE_DRIFT_RAD = 0.3, 0.05
 """Drift allowance at zero path length: the errors of the two submaps themselves."""
-ALIGNMENT_MARGIN_M, ALIGNMENT_MARGIN_RAD = 0.3, 0.1
+ALIGNMENT_MARGIN_M, ALIGNMENT_MARGIN_RAD = BASE_DRIFT_M, 2.0 * BASE_DRIFT_RAD
 """The refined alignment may lie this far outside the search window."""
 CLOSURE_PATH_M = 1.0
 """Path length that crossing an accepted closure counts as, metres: a closure is not exact."""
@@ -52,23 +50,21 @@ MINIMUM_SPREAD_M = 3.0
 """Travel over which they are spread at least: closures from one place are one piece of evidence."""
 LOOP_M, LOOP_PER_M = 0.25, 0.02
 """Two closures are consistent if their loop closes to this many metres, plus so many per metre of path in it."""
-LOOP_RAD, LOOP_RAD_PER_M = 0.05, 0.002
+LOOP_RAD, LOOP_RAD_PER_M = BASE_DRIFT_RAD, 0.1 * LOOP_PER_M
 """The same for the heading, in radians and radians per metre."""
 MOST_NEARBY, NEARBY_M = 10, 2.0
 """Most submaps in a square of the map, of this side in metres, that later ones are compared with; beyond, the oldest is
 forgotten."""
-KNOWN_CANDIDATES = 1
-"""Earlier visits that a submap in a square with more than ``MOST_NEARBY`` is compared with: one closure ties it to a
-well-known area."""
-SIMILAR_PLACES = 24
-"""Most similar earlier submaps among which the places to compare are chosen."""
 LEAST_GAP_M = 12.0
 """Least travel between the anchors of two submaps that are compared, metres."""
 SIGHT_M = 8.0
 """Largest distance between the anchors of two submaps that are compared, besides the drift allowance; farther ones
 overlap too little, metres."""
 MOST_CANDIDATES = 4
-"""Largest number of earlier visits that a submap is compared with."""
+"""Largest number of earlier visits that a submap is compared with; in a square with more than ``MOST_NEARBY``, one
+closure ties it to the well-known area."""
+SIMILAR_PLACES = 6 * MOST_CANDIDATES
+"""Most similar earlier submaps among which the places to compare are chosen."""
 DRIFT_M_M, DRIFT_RAD_M = 0.03, 0.006
 """Drift of the position and the heading allowed for, per metre of path through the graph: metres, and radians."""
 WIDEST_M = 15.0
@@ -113,8 +109,8 @@ class LocalClosure:
 
     @property
     def is_surprising(self) -> bool:
-        """Whether it contradicts the estimate."""
-        return self.innovation_m > SURPRISE_M or abs(self.innovation[2]) > SURPRISE_RAD
+        """Whether it contradicts the estimate, so that the graph is solved at once."""
+        return self.innovation_m > SYMMETRY_M or abs(self.innovation[2]) > SYMMETRY_RAD
 
 
 class PlaceRecognizer(Protocol):
@@ -174,7 +170,7 @@ class LoopCloser:
         candidates = self._candidates(later, anchors, paths)
         found = [
             closure
-            for earlier in candidates[: KNOWN_CANDIDATES if is_known else MOST_CANDIDATES]
+            for earlier in candidates[: 1 if is_known else MOST_CANDIDATES]
             if (closure := self._compare(earlier, later, anchors, paths[earlier])) is not None
         ]
         return self._accept(found, self._recognized(later, anchors, paths), anchors)
@@ -191,13 +187,11 @@ class LoopCloser:
         return len(surplus) > 0
 
     def _is_held(self) -> NDArray[np.bool_]:
-        """Which submaps others are compared with, shape (S,)."""
         held = np.zeros(len(self.submaps), np.bool_)
         held[list(self._held)] = True
         return held
 
     def _paths_from(self, later: int) -> FloatArray:
-        """Shortest path through the pose graph from one submap to every other, metres, shape (S,)."""
         closures = np.array(self._accepted, dtype=np.int64).reshape(-1, 2)
         paths: FloatArray = _shortest_paths(later, np.diff(self._travel), closures, CLOSURE_PATH_M)
         return paths
@@ -223,7 +217,6 @@ class LoopCloser:
         return best
 
     def _compare(self, earlier: int, later: int, anchors: FloatArray, path_m: float) -> LocalClosure | None:
-        """Search where the drift allowance is wide, then verify; None if the submaps do not show the same place."""
         a, b = self._submap(earlier), self._submap(later)
         predicted = se2.between(anchors[earlier], anchors[later])
         radius, angle = self._drift_allowance(path_m).tolist()
@@ -264,7 +257,6 @@ class LoopCloser:
         return sorted(found, key=lambda c: (c.check.support, c.check.worse.overlap))[-1:]
 
     def _lookalikes(self, recognizer: PlaceRecognizer, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
-        """The most similar places beyond the search's reach, ``SIGHT_M`` of travel apart from each other."""
         travel = self._travel
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
         drift = self._drift_allowance(paths)
@@ -296,7 +288,6 @@ class LoopCloser:
     def _accept(
         self, found: list[LocalClosure], recognized: list[LocalClosure], anchors: FloatArray
     ) -> list[LocalClosure]:
-        """Accept expected and conclusive closures at once; others wait until enough of them are consistent."""
         accepted = [c for c in found if self._is_expected(c) or self._is_conclusive(c)]
         pairs = {(c.earlier, c.later) for c in found}
         fresh = [c for c in recognized if (c.earlier, c.later) not in pairs]
@@ -312,12 +303,10 @@ class LoopCloser:
 
     @staticmethod
     def _is_expected(closure: LocalClosure) -> bool:
-        """Whether a closure passes the loose gate with a narrow drift allowance."""
         return closure.check.loose and closure.drift_m <= NARROW_M
 
     @staticmethod
     def _is_conclusive(closure: LocalClosure) -> bool:
-        """Whether a closure needs no support: strict, informative, with much overlap, and near its prediction."""
         overlap = closure.check.worse.overlap
         near = closure.innovation_m < CONCLUSIVE_SHARE * closure.drift_m + CONCLUSIVE_M
         return closure.check.strict and closure.check.informative and overlap > CONCLUSIVE_OVERLAP and near
@@ -348,7 +337,6 @@ def _support(cluster: Sequence[LocalClosure]) -> float:
 
 
 def _is_enough(cluster: Sequence[LocalClosure], travel: FloatArray) -> bool:
-    """Whether consistent closures are enough, from enough places, and fix the pose in every direction."""
     spread_m = np.ptp(travel[[c.later for c in cluster]])
     informative = any(c.check.informative for c in cluster)
     return bool(_support(cluster) >= MINIMUM_SUPPORT and spread_m >= MINIMUM_SPREAD_M and informative)

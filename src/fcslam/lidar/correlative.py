@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from fcslam.compiled import njit
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.scan import PointScan
+from fcslam.lidar.submap import FREE_CELL_M
 from fcslam.records import FloatArray
 
 MAXIMUM_REACH_M = 25.0
 """Points farther than this do not enlarge the likelihood grid."""
 REACH_QUANTILE = 0.9
 """The angle step moves a point at this quantile of the distances by one cell."""
-CELL_M = 0.1
+CELL_M = FREE_CELL_M
 """Side of a cell of the likelihood grid, and standard deviation of the likelihood around a surface, metres."""
 MOST_LEVELS = 6
 """Most levels of the pyramid; a step on the coarsest one of them is 2^5 cells."""

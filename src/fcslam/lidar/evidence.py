@@ -22,7 +22,8 @@ from fcslam.records import FloatArray
 CLEAR, LEAST_KNOWN = 0.8, 0.5
 """Least share of the points in known area that a clear match explains; least share of all points in known area. The
 part that an unclear match does not explain may be the only one that stands still."""
-NEAR, FAR = 2.0, 4.0
+NEAR = 2.0
+FAR = 2.0 * NEAR
 """A match agrees with odometry up to the first distance and contradicts it from the second on, in standard deviations
 of odometry's learned error."""
 LEAST_SIGMA_M, LEAST_SIGMA_RAD, SIGMA_PER_TURN = 0.025, 0.01, 0.1

@@ -207,7 +207,6 @@ class _Trial:
 
 
 def _pairs(scans: Iterable[LaserScan]) -> tuple[list[ScanPair], list[ScanPair]]:
-    """Pairs of scans one after the other with a move between them, and those with a turn."""
     moves: list[ScanPair] = []
     turns: list[ScanPair] = []
     first: LaserScan | None = None
@@ -227,7 +226,6 @@ def _pairs(scans: Iterable[LaserScan]) -> tuple[list[ScanPair], list[ScanPair]]:
 
 
 def _moved(first: LaserScan, scan: LaserScan) -> tuple[bool, bool]:
-    """Whether the robot has moved and turned enough between two scans."""
     x, y, theta = se2.between(first.T_odom_base, scan.T_odom_base).tolist()
     return math.hypot(x, y) > LEAST_MOVE_M, abs(theta) > LEAST_TURN_RAD
 

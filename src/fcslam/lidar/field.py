@@ -21,7 +21,7 @@ TILE: Final = 16
 """Cells along one side of a tile."""
 REACH_M: Final = 0.5
 """Cells farther than this from every surfel hold none."""
-MERGE_M: Final = 0.05
+MERGE_M: Final = CELL_M
 """A return this close to a surfel that faces the same way is merged into it."""
 MEAN_OVER: Final = 30.0
 """A surfel is a running mean over this many returns, so it can follow its surface."""
@@ -32,7 +32,7 @@ MERGED: Final = 4
 """Columns of a surfel that later ones serve to merge returns."""
 FIRST_SEEN: Final = 6
 """Column of the motion after which a surfel was first seen."""
-MOST_SURFELS: Final = 32767
+MOST_SURFELS: Final = int(np.iinfo(np.int16).max)
 """Largest number of labels: 1.6 km of walls. Later returns are merged into surfels or left out."""
 TOO_MANY_WALLS: Final = f"has too many walls; at most {1e-3 * MERGE_M * MOST_SURFELS:.1f} km can be used"
 
@@ -197,7 +197,6 @@ def _insert(points, normals, solitary, T, start, field):  # type: ignore[no-unty
 
 @njit(allocates=False)
 def _within(x, y, field):  # type: ignore[no-untyped-def]
-    """Whether the table holds every cell within reach of (x, y)."""
     side = field.table.shape[0] * TILE * CELL_M
     margin = REACH_M + CELL_M
     cx, cy = x - field.corner[0], y - field.corner[1]
@@ -242,7 +241,6 @@ def _merge(x, y, nx, ny, solitary, label, field):  # type: ignore[no-untyped-def
 
 @njit(allocates=False)
 def _spread(x, y, label, field):  # type: ignore[no-untyped-def]
-    """Label every cell within reach that has no nearer surfel, row by row of the disc and tile by tile."""
     corner, labels, surfels = field.corner, field.labels, field.surfels
     cx = int(np.floor((x - corner[0]) / CELL_M))
     cy = int(np.floor((y - corner[1]) / CELL_M))
@@ -270,7 +268,6 @@ def _spread(x, y, label, field):  # type: ignore[no-untyped-def]
 
 @njit(allocates=False)
 def _tile_at(tx, ty, field):  # type: ignore[no-untyped-def]
-    """Storage number of a tile; allocates it if it had none."""
     tile = field.table[ty, tx]
     if tile == EMPTY:
         tile = field.used[0]

@@ -20,9 +20,8 @@ LONGEST_GAP_S: Final = 1.0
 """A scan after a longer gap says nothing about the motion during the one before it, nor the reverse."""
 PASSES: Final = 8
 """Most matches of the two scans."""
-SAME_M, SAME_RAD = 1e-3, 1e-3
-"""Motions that differ by less are the same."""
-AT_REST: Final = (0.0, 0.0, 0.0)
+SAME: Final = 1e-3
+"""Motions that differ by less are the same, metres and radians."""
 SIGMAS: Final = 3.0
 """A motion that the points show less clearly, in standard deviations, may be none."""
 
@@ -42,20 +41,21 @@ def first_sweep(first: LaserScan, second: LaserScan, odometry: OdometryModel) ->
     is_one_laser = first.laser.T_base_laser == second.laser.T_base_laser
     if first.sweep is None or second.sweep is None or not is_one_laser or not 0.0 < elapsed_s <= LONGEST_GAP_S:
         return first.sweep
-    sweep, T_first_second = first.sweep._replace(velocity=AT_REST), np.zeros(3)
+    sweep, T_first_second = Sweep(first.sweep.first_s, first.sweep.last_s), np.zeros(3)
     for _ in range(PASSES):
         tracker = ScanTracker(odometry)
-        begun = tracker.track(replace(first, T_odom_base=frozen(np.zeros(3)), sweep=sweep))
-        assert begun.scan is not None  # a scan without earlier ones is not matched
-        tracker.insert(begun.scan, begun.T_local_base)
+        begun = tracker.localize(replace(first, T_odom_base=frozen(np.zeros(3)), sweep=sweep))
+        assert begun.tracked.scan is not None  # a scan without earlier ones is not matched
+        tracker.commit(begun)
+        tracker.insert(begun.tracked.scan, begun.tracked.T_local_base)
         guess = second.sweep._replace(velocity=sweep.velocity)
         found = tracker.localize(replace(second, T_odom_base=frozen(T_first_second), sweep=guess)).tracked
         before, T_first_second = T_first_second, found.T_local_base
         if T_first_second @ found.information @ T_first_second < SIGMAS**2:
-            return first.sweep._replace(velocity=AT_REST)
+            return Sweep(first.sweep.first_s, first.sweep.last_s)
         x, y, theta = (se2.log(T_first_second) / elapsed_s).tolist()
         sweep = sweep._replace(velocity=(x, y, theta))
         dx, dy, turn = se2.motion(before, T_first_second)
-        if math.hypot(dx, dy) < SAME_M and abs(turn) < SAME_RAD:
+        if math.hypot(dx, dy) < SAME and abs(turn) < SAME:
             break
     return sweep

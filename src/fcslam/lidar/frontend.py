@@ -15,6 +15,7 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
+from fcslam.lidar.evidence import CORRELATED, SIGMA_PER_TURN
 from fcslam.lidar.information import limited_information
 from fcslam.lidar.karto import KartoTracker
 from fcslam.lidar.lasers import Lasers
@@ -42,19 +43,15 @@ KEYSCAN_TURN_RAD = 0.25
 """Turn since the last keyscan after which a scan becomes a keyscan."""
 SUBMAP_REACH_M = 5.0
 """Travel before and after its anchor that a submap covers."""
-POINT_INFORMATION_SHARE = 0.1
-"""Share of the points' information that counts: errors of neighbouring points are correlated, ten count as one."""
-ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_PER_TRAVEL = 0.01, 0.1
-"""Standard deviation of odometry's position between two keyscans that were matched, in metres and per metre of travel.
-It fixes what the points leave open, as along a corridor. It is smaller than in the tracker (``OdometryModel``):
-the match has shown that the wheels did not slip."""
-ODOMETRY_SIGMA_RAD, ODOMETRY_SIGMA_PER_TURN = 0.005, 0.1
-"""The same for the heading, in radians and per radian of turn."""
-FLOOR_SIGMA_M, FLOOR_SIGMA_PER_TRAVEL = 0.003, 0.01
-"""Least standard deviation of the position between two keyscans, in metres and per metre of travel: the error that more
-points do not reduce."""
-FLOOR_SIGMA_RAD, FLOOR_SIGMA_PER_TURN = 0.001, 0.01
-"""The same for the heading, in radians and per radian of turn."""
+POINT_INFORMATION_SHARE = 1.0 / CORRELATED
+"""Share of the points' information that counts: errors of neighbouring points are correlated."""
+ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_RAD = 0.01, 0.005
+"""Constant part of the standard deviations of odometry between two keyscans that were matched, in metres and radians;
+``SIGMA_PER_TURN`` of the travel and the turn comes on top. It fixes what the points leave open, as along a corridor. It
+is smaller than in the tracker (``OdometryModel``): the match has shown that the wheels did not slip."""
+FLOOR_SIGMA_M, FLOOR_SIGMA_RAD, FLOOR_SHARE = 0.003, 0.001, 0.01
+"""Least standard deviations between two keyscans, in metres and radians, and their growth per travel and turn: the
+error that more points do not reduce."""
 
 
 class Tracker(StrEnum):
@@ -225,7 +222,6 @@ class LidarFrontend:
         return build_submap([(k.points, se2.between(anchor, k.T_local_base)) for k in keyscans]), anchor
 
     def _is_keyscan(self, tracked: TrackedScan, laser: int) -> bool:
-        """Whether the robot moved enough since the last keyscan of this laser; so each of them maps what it sees."""
         if tracked.scan is None:
             return False
         if laser not in self._T_local_newest:
@@ -239,7 +235,6 @@ class LidarFrontend:
         return ScanPose(stamp, self._count - 1, se2.between(self._newest.T_local_base, tracked.T_local_base))
 
     def _add_keyscan(self, scan: LaserScan, tracked: TrackedScan, laser: int) -> MappedKeyscan:
-        """Add the scan to the running buffer, with a constraint to the keyscan before it."""
         sweep = None if tracked.sweep is None else tracked.sweep.rounded()
         points = tracked.scan
         if points is None or sweep is not None:
@@ -260,7 +255,6 @@ class LidarFrontend:
         return newest
 
     def _odometry(self, tracked: TrackedScan) -> tuple[Constraint | None, float]:
-        """The constraint from the newest keyscan to the next one, and the path length up to that."""
         if self._newest is None:
             return None, 0.0
         motion = se2.between(self._newest.T_local_base, tracked.T_local_base)
@@ -297,8 +291,8 @@ def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: Odome
     """
     x, y, turn = motion.tolist()
     moved, turned = math.hypot(x, y), abs(turn)
-    sigma_m = ODOMETRY_SIGMA_M + ODOMETRY_SIGMA_PER_TRAVEL * moved
-    sigma_rad = ODOMETRY_SIGMA_RAD + ODOMETRY_SIGMA_PER_TURN * turned
+    sigma_m = ODOMETRY_SIGMA_M + SIGMA_PER_TURN * moved
+    sigma_rad = ODOMETRY_SIGMA_RAD + SIGMA_PER_TURN * turned
     if not odometry.is_measured or not tracked.information.any():  # no wheels, or they may have slipped
         sigma_m, sigma_rad = odometry_error(moved, turned, odometry)
     floor_m, floor_rad = least_sigmas(moved, turned)
@@ -312,7 +306,7 @@ def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: Odome
 
 def least_sigmas(moved_m: float, turned_rad: float) -> tuple[float, float]:
     """Least standard deviations of the position (m) and heading (rad) between two consecutive keyscans."""
-    return FLOOR_SIGMA_M + FLOOR_SIGMA_PER_TRAVEL * moved_m, FLOOR_SIGMA_RAD + FLOOR_SIGMA_PER_TURN * turned_rad
+    return FLOOR_SIGMA_M + FLOOR_SHARE * moved_m, FLOOR_SIGMA_RAD + FLOOR_SHARE * turned_rad
 
 
 def _valid_ranges(ranges_m: Ranges, max_range_m: float) -> Ranges:

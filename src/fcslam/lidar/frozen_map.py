@@ -50,7 +50,6 @@ def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
 
 
 def _surface(occupancy: OccupancyMap) -> PointScan:
-    """Occupied cells beside free ones as points with normals towards the free side."""
     free = occupancy.cells == Occupancy.FREE
     beside = (occupancy.cells == Occupancy.OCCUPIED) & (distance_transform_edt(~free) <= ADJACENT_CELLS)
     rows, columns = np.nonzero(beside)

@@ -48,7 +48,6 @@ def _limited(points, heading, prior, variance):  # type: ignore[no-untyped-def]
 
 @njit
 def _invert(matrix, inverse):  # type: ignore[no-untyped-def]
-    """Write the inverse of a positive definite matrix (3, 3) into ``inverse``."""
     unit = np.zeros(3)
     for c in range(3):
         unit[c] = 1.0

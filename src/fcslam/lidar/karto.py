@@ -50,33 +50,34 @@ class KartoTracker(ScanTracker):
     def localize(self, scan: LaserScan) -> TrackingResult:
         """Find the pose of the next scan; the tracker does not change before ``commit``."""
         # 1. Prediction: the last pose, moved by odometry.
-        T_local_guess, moved_m, turned_rad = self._predict(scan)
         laser = frozenset((scan.laser.T_base_laser,))
-        unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad, laser, self._trust, self._usual
+        predicted = self._predicted(scan)._replace(matched_here=laser)
+        T_local_guess = predicted.T_local_base
+        by_odometry = TrackedScan(T_local_guess, NO_INFORMATION, None, scan.sweep)
         # 2. Gates: a scan near the last keyscan is not matched.
         if self._fields and not self._passes(laser, T_local_guess):
-            return TrackingResult(TrackedScan(T_local_guess, NO_INFORMATION, None, scan.sweep), *unmatched)
+            return TrackingResult(by_odometry, predicted)
         points = point_scan(scan.matched_ranges_m, scan.laser, scan.sweep)
-        by_odometry = TrackedScan(T_local_guess, NO_INFORMATION, points, scan.sweep)
+        by_odometry = by_odometry._replace(scan=points)
         if not self._fields:
-            return TrackingResult(by_odometry, *unmatched)
+            return TrackingResult(by_odometry, predicted)
         # 3. Scan matching. Without any response, odometry alone gives the pose.
         near, field = points.only(np.hypot(*(points.points - points.origin).T) < RANGE_M), self._fields[0][0]
         found = search(near, field, T_local_guess, WINDOW, visible_only=True)
         if found.score == 0.0:
-            return TrackingResult(by_odometry, *unmatched)
+            return TrackingResult(by_odometry, predicted)
         information = np.linalg.inv(match_covariance(near, field, found.T_field_base))
         tracked = TrackedScan(found.T_field_base, np.asarray(information), points, scan.sweep)
-        innovation = se2.motion(T_local_guess, found.T_field_base)
-        trust = self._trust.learn(innovation, odometry_error(moved_m, turned_rad, self._odometry))
+        error = odometry_error(predicted.moved_m, predicted.turned_rad, self._odometry)
+        trust = predicted.trust.learn(se2.motion(T_local_guess, found.T_field_base), error)
+        accepted = predicted._replace(T_local_base=found.T_field_base, moved_m=0.0, turned_rad=0.0, trust=trust)
         # The grid knows surfaces, but no free space: what is off them lies in unknown area.
-        accepted = found.score, found.score, scan.T_odom_base, 0.0, 0.0, laser, trust, self._usual
-        return TrackingResult(tracked, *accepted)
+        return TrackingResult(tracked, accepted, found.score, found.score)
 
     def insert(self, points: PointScan, T_local_base: FloatArray, laser_count: int = 1) -> None:
         """Add a keyscan to the running buffer (see ``ScanTracker``)."""
         super().insert(points, T_local_base, laser_count)
-        self._T_local_newest[self._matched_here] = T_local_base
+        self._T_local_newest[self._state.matched_here] = T_local_base
 
     def empty_buffer(self) -> None:
         """Forget all keyscans: the pose goes on by odometry until the next one is inserted."""

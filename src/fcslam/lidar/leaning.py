@@ -54,7 +54,6 @@ def floor_line(scans: Sequence[LaserScan]) -> FloorLine | None:
 
 
 def _at_line(line: FloorLine, scan: LaserScan) -> LaserScan:
-    """The scan with the returns at the line alone."""
     heading_rad = line.heading_rad + scan.laser.T_base_laser[2]
     ahead = rays_of(scan.laser).directions @ (math.cos(heading_rad), math.sin(heading_rad))
     away = scan.ranges_m * ahead / line.distance_m
@@ -62,7 +61,6 @@ def _at_line(line: FloorLine, scan: LaserScan) -> LaserScan:
 
 
 def _line_ahead(scans: Iterable[LaserScan]) -> FloorLine | None:
-    """A line at which the ranges of many beams end."""
     places = list(islice(scans_apart(scans), MOST_PLACES))
     if len(places) < FEWEST_PLACES:
         return None

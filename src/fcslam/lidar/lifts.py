@@ -1,7 +1,7 @@
 """A robot in a closed cabin, such as that of a lift: all around it are walls, until a door opens.
 
 A cabin is told from a room by its size alone. So a robot that waited in a closed room counts as well, and only what it
-sees behind the door tells whether it is on another floor (``fcslam.lidar.lost.rode``).
+sees behind the door tells whether it is on another floor (``fcslam.lidar.lost.is_lost``).
 """
 
 import math

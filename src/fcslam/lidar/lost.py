@@ -23,23 +23,17 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
-from fcslam.lidar.evidence import CORRELATED
+from fcslam.lidar.evidence import CORRELATED, LEAST_KNOWN
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.matching import match_scan
-from fcslam.lidar.odometry import odometry_error
+from fcslam.lidar.odometry import FIRST_MATCHES, OdometryModel, OdometryTrust, odometry_error
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import Agreement
 from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, SUPPORTED, TrackingResult
 from fcslam.lidar.verification import VERIFICATION, verify
 from fcslam.records import FloatArray, LaserScan
 
-TRUSTED, TRUSTED_MATCHES = 1.0, 20
-"""Largest scale of odometry's error that is trusted without a map, and the least number of matches that showed it. The
-constraint over the gap has the error by the model, of scale 1."""
-CONTINUOUS, CONTINUOUS_KNOWN = 0.6, 0.5
-"""Two scans show one place if the later one has a larger share of its points in known area on surfaces of the earlier
-one. A larger share of all points lies in known area, too."""
 DOUBTFUL_TRAVEL_M = 1.0
 """Least travel over consecutive doubtful scans before they are compared, metres."""
 FEWEST_SCANS = 5
@@ -51,20 +45,21 @@ SETTLED_M = 3.0
 AGREEING = 0.90
 """Least median share of points that the doubtful scans explain of each other; below it, nothing is decided."""
 LOST_EXPLAINED = 0.60
-"""A lost robot sees a smaller share of its points in known area on a surface."""
+"""A lost robot sees a smaller share of its points in known area on a surface. Two scans show one place if the share is
+larger."""
 LOST_VIOLATION = 0.30
 """A lost robot sees a larger share of its points in known area in free space."""
 RODE, RODE_OVERLAP = 0.73, 0.40
 """A robot that leaves a closed cabin on another floor sees a smaller share on a surface, less the share in free space.
 The cabin says where its door is, so a part of the walls decides; but a larger share of them lies in known area."""
-LEAST_OVERLAP = 0.25
+LEAST_OVERLAP = VERIFICATION.loose.overlap
 """Least share of all points in known area; below it, nothing is decided."""
 STAYED_M, LARGEST_SPEED, REACHABLE_S = 1.0, 2.0, 5.0
 """Without odometry, a robot is looked for within so many metres, and so many more for each second of a gap in the
 scans, m/s. After a longer gap, in seconds, that would be another room with the same walls: it must be where it was."""
 SEEN_S = 2.0
 """After a shorter gap, in seconds, a robot that is found nowhere counts as where it was: a match finds it again."""
-GAP_TRAVEL_M = 2.0
+GAP_TRAVEL_M = 2.0 * DOUBTFUL_TRAVEL_M
 """``DOUBTFUL_TRAVEL_M`` after a gap, metres: more walls fit in fewer ways."""
 LEAST_RATIO, LEAST_RIVAL_M, LARGEST_VIOLATION = 1.5, 5.0, 0.12
 """The best alignment after a gap scores higher than the best one elsewhere by this factor. The one elsewhere counts as
@@ -117,33 +112,22 @@ def can_decide(scans: Sequence[LaserScan], travel_m: float = DOUBTFUL_TRAVEL_M, 
     return bool(far) or len(scans) >= most
 
 
-def is_lost(scans: Sequence[LaserScan], frontend: LidarFrontend) -> bool:
+def is_lost(scans: Sequence[LaserScan], frontend: LidarFrontend, closed_s: float | None = None) -> bool:
     """Whether deferred scans show another place than the newest keyscans of the front end.
 
     Args:
         scans: consecutive scans that the front end has not processed.
         frontend: the robot's front end; it does not change.
+        closed_s: stamp at which the door of the cabin closed that the robot leaves, seconds; None: it leaves none.
     """
     fresh = frontend.fresh()
     if not _are_consistent(scans, fresh):
         return False
-    worse = _agreement_at(frontend.localize(scans[0]).tracked.T_local_base, frontend, fresh)
+    T_local_first = frontend.localize(scans[0]).tracked.T_local_base
+    worse = _agreement_at(T_local_first, frontend, fresh, math.inf if closed_s is None else closed_s)
+    if closed_s is not None:
+        return worse.overlap >= RODE_OVERLAP and worse.explained - worse.violation < RODE
     return worse.overlap >= LEAST_OVERLAP and worse.explained < LOST_EXPLAINED and worse.violation > LOST_VIOLATION
-
-
-def rode(scans: Sequence[LaserScan], frontend: LidarFrontend, closed_s: float) -> bool:
-    """Whether deferred scans of a robot that left a cabin contradict what was behind its door before.
-
-    Args:
-        scans: consecutive scans since the door opened, which the front end has not processed.
-        frontend: the robot's front end; it does not change.
-        closed_s: stamp at which the door closed, seconds.
-    """
-    fresh = frontend.fresh()
-    if not _are_consistent(scans, fresh):
-        return False
-    worse = _agreement_at(frontend.localize(scans[0]).tracked.T_local_base, frontend, fresh, closed_s)
-    return worse.overlap >= RODE_OVERLAP and worse.explained - worse.violation < RODE
 
 
 def is_unplaced(scan: LaserScan, frontend: LidarFrontend) -> bool:
@@ -202,7 +186,10 @@ def is_in_reach(T_local_base: FloatArray, scan: LaserScan, frontend: LidarFronte
 
 
 def drove_on(
-    before: Mapping[tuple[float, float, float], LaserScan], scans: Sequence[LaserScan], frontend: LidarFrontend
+    before: Mapping[tuple[float, float, float], LaserScan],
+    scans: Sequence[LaserScan],
+    odometry: OdometryModel,
+    trust: OdometryTrust,
 ) -> bool:
     """Whether trusted odometry and the scans themselves agree that a robot drove from the last scans to doubtful ones.
 
@@ -211,28 +198,25 @@ def drove_on(
     Args:
         before: the last scan of each laser before the doubtful ones, by its mounting.
         scans: consecutive doubtful scans.
-        frontend: the robot's front end; it does not change.
+        odometry, trust: the error of odometry by the model and as learned.
     """
-    trust = frontend.trust
-    if trust.matches < TRUSTED_MATCHES or max(trust.position, trust.heading) > TRUSTED:
+    # The constraint over the gap has the error by the model, of scale 1.
+    is_trusted = trust.matches >= FIRST_MATCHES and max(trust.position, trust.heading) <= 1.0
+    if not is_trusted or not odometry.is_measured:
         return False
-    if not frontend.odometry.is_measured:
-        return False
-    pairs = ((before.get(scan.laser.T_base_laser), scan) for scan in scans)
-    return any(last is not None and _show_one_place(last, scan, frontend) for last, scan in pairs)
-
-
-def _show_one_place(before: LaserScan, now: LaserScan, frontend: LidarFrontend) -> bool:
-    """Whether a scan shows what an earlier one of the same laser shows, where odometry says."""
-    if before.laser != now.laser:
-        return False
-    x, y, turn = motion = se2.between(before.T_odom_base, now.T_odom_base)
-    error = frontend.trust.scale(odometry_error(math.hypot(x, y), abs(float(turn)), frontend.odometry))
-    field = SurfelField(np.zeros(3))
-    field.insert(point_scan(before.matched_ranges_m, before.laser, before.sweep), np.zeros(3))
-    scan = point_scan(now.matched_ranges_m, now.laser, now.sweep).thinned(POINT_SPACING_M, POINT_LIMIT)
-    match = match_scan(scan, field, motion, CORRELATED * error.information)
-    return match.known >= CONTINUOUS_KNOWN and match.explained >= CONTINUOUS * match.known
+    for now in scans:
+        last = before.get(now.laser.T_base_laser)
+        if last is None or last.laser != now.laser:
+            continue
+        x, y, turn = motion = se2.between(last.T_odom_base, now.T_odom_base)
+        error = trust.scale(odometry_error(math.hypot(x, y), abs(float(turn)), odometry))
+        field = SurfelField(np.zeros(3))
+        field.insert(point_scan(last.matched_ranges_m, last.laser, last.sweep), np.zeros(3))
+        scan = point_scan(now.matched_ranges_m, now.laser, now.sweep).thinned(POINT_SPACING_M, POINT_LIMIT)
+        match = match_scan(scan, field, motion, CORRELATED * error.information)
+        if match.known >= LEAST_KNOWN and match.explained >= LOST_EXPLAINED * match.known:
+            return True
+    return False
 
 
 def _are_consistent(scans: Sequence[LaserScan], fresh: LidarFrontend) -> bool:

@@ -49,7 +49,7 @@ WALL_M: Final = 0.8
 FEWEST_STRETCHES: Final = 20
 """Of fewer stretches, the noise is taken to be ``NOISE_M``, that of a common laser."""
 NOISE_M, WIDEST_NOISE_M = 0.01, 0.1
-THROUGH_M: Final = 0.25
+THROUGH_M: Final = 0.5 * STRETCH_M
 """A wall contradicts where the other map is free at this distance on both of its sides: beams passed through it. At the
 edge of what a robot saw, its free space touches walls that it did not see."""
 PARALLEL: Final = 0.7
@@ -156,7 +156,6 @@ def compare(a: LocalSubmap, b: LocalSubmap, T_a_b: FloatArray, noise: Noise) -> 
 
 
 def _log_ratio(offsets_m: FloatArray, noise: Noise) -> FloatArray:
-    """Log-likelihood ratios of offsets, the same place to another."""
     same = _density(offsets_m, np.hypot(noise.offset_m, SAME_M), noise.moved)
     return np.asarray(np.log(same / _density(offsets_m, np.hypot(noise.offset_m, OTHER_M), UNLIKE)))
 
@@ -167,15 +166,12 @@ def _density(offsets_m: FloatArray, sigma_m: float, uniform: float) -> FloatArra
 
 
 def _expected_ratio(noise: Noise) -> float:
-    """Mean log-likelihood ratio of an offset in the same place."""
     offsets_m = np.linspace(-VIOLATION_M, VIOLATION_M, 601)
     weights = _density(offsets_m, float(np.hypot(noise.offset_m, SAME_M)), noise.moved)
     return float((weights * _log_ratio(offsets_m, noise)).sum() / weights.sum())
 
 
 class _Stretches(NamedTuple):
-    """The stretches of wall of one map in known area of another."""
-
     offsets_m: FloatArray
     """Of those on a wall, along its normal, shape (K,)."""
     in_free: int
@@ -229,7 +225,6 @@ def _grown(image: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 @njit
 def _offsets(points, normals, T, field, free, free_corner):  # type: ignore[no-untyped-def]
-    """Offset of each point from the wall that it lies on, and its state."""
     cos, sin = np.cos(T[2]), np.sin(T[2])
     offsets, states = np.zeros(len(points)), np.zeros(len(points), np.int8)
     for i in range(len(points)):

@@ -31,8 +31,6 @@ DAMPING: Final = 1e-6
 SMALL_STEP_M: Final = 2e-4
 SMALL_STEP_RAD: Final = 1e-4
 """A smaller step means that Gauss-Newton has converged at the present scale of the loss."""
-INLIER_SIGMA_M: Final = 0.06
-"""Standard deviation of a point's distance to its surface, for the likelihood of a scan."""
 INLIER_RATIO: Final = 20.0
 """Density of points on their surface relative to that of outliers."""
 INDEPENDENT: Final = 0.2
@@ -44,14 +42,15 @@ FAST_SHRINK: Final = 0.35
 """Factor of the loss scale after each step; the fast one after a small step."""
 MOST_ITERATIONS = 20
 """Largest number of Gauss-Newton steps."""
-WIDE_SCALE_M = 0.30
-"""Scale of the robust loss at the first step, metres, if the guess is that of odometry."""
 NARROW_SCALE_M = 0.06
-"""Scale of the robust loss at the last step, metres."""
-POINT_SIGMA_M = 0.03
+"""Scale of the robust loss at the last step, and standard deviation of a point's distance to its surface in the
+likelihood of a scan, metres."""
+POINT_SIGMA_M = 0.5 * NARROW_SCALE_M
 """Standard deviation of a point's distance, metres; wide, as errors of neighbours are correlated."""
 EXPLAINED_M = 0.10
 """Distance, in metres, up to which a point lies on its surface."""
+WIDE_SCALE_M = 5.0 * NARROW_SCALE_M
+"""Scale of the robust loss at the first step, metres, if the guess is that of odometry."""
 
 
 class ScanMatch(NamedTuple):
@@ -118,8 +117,6 @@ def match_scan(
 
 
 class _Points(NamedTuple):
-    """The arrays of a scan, for compiled code."""
-
     points: FloatArray
     normals: FloatArray
     solitary: NDArray[np.bool_]
@@ -128,8 +125,6 @@ class _Points(NamedTuple):
 
 
 class _Loss(NamedTuple):
-    """The robust loss of the points at one step."""
-
     scale: float
     """Scale of the loss, metres."""
     clutter: float
@@ -216,7 +211,6 @@ class _Equations(NamedTuple):
 
 @njit(allocates=False)
 def _normal_equations(equations, scan, pose, velocity, field, loss, velocity_prior):  # type: ignore[no-untyped-def]
-    """Write the normal equations at ``pose`` and ``velocity`` into ``equations``."""
     H, g, mixed, own, reduced = equations
     own_pose, mixed_sums, own_velocity, moment, velocity_moment = _sums(scan, pose, velocity, field, loss)
     s2 = 1.0 / (POINT_SIGMA_M * POINT_SIGMA_M)
@@ -267,7 +261,6 @@ def _weight_of_new(scan, pose, field):  # type: ignore[no-untyped-def]
 
 @njit(allocates=False)
 def _is_new(surfel, field):  # type: ignore[no-untyped-def]
-    """Whether a surfel of a field that takes returns was first seen a moment ago."""
     return surfel[FIRST_SEEN] > field.used[2] - NEW_MOTION
 
 
@@ -402,7 +395,7 @@ def _fit(scan, pose, velocity, field):  # type: ignore[no-untyped-def]
             on_surface = abs(e) < EXPLAINED_M and d2 <= ALONG_LIMIT2 * EXPLAINED_M * EXPLAINED_M
         if on_surface:
             explained += 1
-        likelihood_ratio = INLIER_RATIO * np.exp(-0.5 * likely2 / (INLIER_SIGMA_M * INLIER_SIGMA_M))
+        likelihood_ratio = INLIER_RATIO * np.exp(-0.5 * likely2 / (NARROW_SCALE_M * NARROW_SCALE_M))
         log_likelihoods[i] = INDEPENDENT * np.log1p(likelihood_ratio)
         total += log_likelihoods[i]
     n = max(1, len(points))

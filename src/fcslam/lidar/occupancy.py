@@ -116,8 +116,6 @@ _AT_ONCE = Sweep(0.0, 0.0)
 
 
 class _Layout(NamedTuple):
-    """Where the grid lies and how fine it is."""
-
     resolution_m: float
     column: int  # of the lower left cell, counted from the origin of map
     row: int
@@ -126,8 +124,6 @@ class _Layout(NamedTuple):
 
 
 class _Counts(NamedTuple):
-    """Of one period, by cell."""
-
     hits: Counts
     passes: Counts
     scans: Counts
@@ -233,7 +229,6 @@ def _by_laser(keyscans: Sequence[Casting], config: OccupancyConfig) -> list[_Bea
 
 
 def _cast_all(groups: list[_Beams], layout: _Layout, config: OccupancyConfig, counts: _Counts) -> None:
-    """Cast the beams with a return, then those without."""
     numbered = list(zip(groups, accumulate((len(beams.ranges_m) for beams in groups), initial=1), strict=False))
     for beams, first in numbered:
         _cast(beams, layout, config.usable_range_m, counts, first)
@@ -347,7 +342,6 @@ def _bounds(beams, usable):  # type: ignore[no-untyped-def]
 
 @njit(allocates=False)
 def _ray(beams, k, i):  # type: ignore[no-untyped-def]
-    """Origin and direction of beam i of scan k in ``map``, as four numbers."""
     ox, oy, dx, dy = ray_at(
         beams.origins[i], beams.directions[i], beams.times_s[i], beams.velocity[k], beams.acceleration[k]
     )
@@ -374,7 +368,6 @@ def _cast(beams, layout, usable, counts, first):  # type: ignore[no-untyped-def]
 
 @njit(allocates=False)
 def _clear(beams, layout, counts, first, occupied):  # type: ignore[no-untyped-def]
-    """Count the passes of the beams without return."""
     for k in range(len(beams.ranges_m)):
         for i in range(len(beams.times_s)):
             length = beams.open_m[k, i] / layout.resolution_m - CLEARANCE_CELLS

@@ -45,7 +45,6 @@ def _is_polygon(corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, 
 
 
 def _sides(corners: Sequence[tuple[float, float]]) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
-    """Both ends of each side of a polygon."""
     return pairwise((*corners, *corners[:1]))
 
 

@@ -73,8 +73,6 @@ def _judged(aligned: Sequence[Aligned], pairs: Sequence[Pair], config: Verificat
 
 @dataclass(slots=True)
 class _Peer:
-    """Another process, and what it was sent."""
-
     executor: Executor
     sent: set[bytes] = field(default_factory=set)
     """Hashes of the submaps that it was sent and may keep."""

@@ -153,7 +153,6 @@ def ray_at(origin, direction, t, velocity, acceleration):  # type: ignore[no-unt
 
 @njit
 def _project_swept(ranges, origins, directions, sweep, spacing, max_range):  # type: ignore[no-untyped-def]
-    """The fields of the ``PointScan`` of a sweep, from the beams as they are at its stamp."""
     origins, directions, times = _swept(origins, directions, sweep)
     points, normals, solitary, kept = _project(ranges, origins, directions, spacing, max_range)
     return points, normals, solitary, origins[len(origins) // 2].copy(), times[kept]
@@ -249,7 +248,6 @@ def _across(difference, mixed):  # type: ignore[no-untyped-def]
 
 @njit(allocates=False)
 def _is_connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-def]
-    """Whether returns i and i + 1 lie on one surface."""
     if kept[i + 1] - kept[i] > 2:
         return False
     dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
@@ -260,7 +258,6 @@ def _is_connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-
 
 @njit
 def _thin(points, normals, solitary, times, spacing, limit, radius):  # type: ignore[no-untyped-def]
-    """The arrays of ``PointScan.thinned``."""
     keep = np.empty(len(points), np.int64)
     n = 0
     step = before = 0.0  # the last two distances of consecutive returns; the lesser leaves out gaps

@@ -17,11 +17,11 @@ from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
 
 FREE_CELL_M: Final = 0.1
-FREE_MARGIN_M: Final = 0.2
+FREE_MARGIN_M: Final = 2.0 * FREE_CELL_M
 """A beam clears the cells up to this far before its end."""
 RADIUS_M: Final = 30.0
 """Surfaces and free space farther than this from the anchor are left out: distant ones are seen too sparsely."""
-SPACING_M: Final = 0.1
+SPACING_M: Final = FREE_CELL_M
 """Surfaces are compared at points this far apart."""
 SEEN_THROUGH: Final = 3
 """A surfel counts as moving, and is dropped, if the beams of at least this many scans passed through its cell ..."""
@@ -29,7 +29,7 @@ SEEN_THROUGH_RATIO: Final = 2
 """... and of more than this many times the scans with a return in it: beams at a grazing angle pass walls, too."""
 ON_SURFEL_M: Final = 0.15
 """A point this close to a surfel that faces the same way lies on its surface."""
-VIOLATION_M: Final = 0.30
+VIOLATION_M: Final = 2.0 * ON_SURFEL_M
 """A point in free space farther than this from any surfel contradicts the submap."""
 LEVER_M: Final = 3.0
 """Lever arm that scales turns to shifts: about that of the points in a submap of a room."""

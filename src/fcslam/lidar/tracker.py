@@ -8,19 +8,17 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.lidar.correlative import SearchWindow, search
-from fcslam.lidar.evidence import over_steps, resolve
-from fcslam.lidar.field import SurfelField
-from fcslam.lidar.matching import FIXED, ScanMatch, match_scan
+from fcslam.lidar.evidence import CLEAR, FAR, LEAST_KNOWN, over_steps, resolve
+from fcslam.lidar.field import CELL_M, SurfelField
+from fcslam.lidar.matching import FIXED, WIDE_SCALE_M, ScanMatch, match_scan
 from fcslam.lidar.odometry import OdometryError, OdometryModel, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import FloatArray, LaserScan, Sweep
 from fcslam.sources.contradictions import STILL_M, STILL_RAD
 
-GOOD_SHARE, GOOD_KNOWN, GOOD_SIGMA = 0.8, 0.5, 0.3
-"""Limits of a good match, by which odometry is judged: the share of the points in known area that it explains, and the
-share of all points that lie there. Its points fix the position in every direction to this share of odometry's error
-by the model, so that its distance from odometry is the error of odometry.
-"""
+GOOD_SIGMA = 0.3
+"""The points of a good match, by which odometry is judged, fix the position in every direction to this share of
+odometry's error by the model, so that its distance from odometry is the error of odometry. The match is clear, too."""
 SEARCH_GAIN = 3.0
 """The result of a search replaces a match near odometry only if its log-probability is higher by this: the best of many
 poses explains some points by chance."""
@@ -39,7 +37,7 @@ LARGEST_VELOCITY = 30.0
 UNSURE_M = 0.05
 """Learned standard deviation of odometry, in metres, beyond which a match has several starts. After a long step a match
 may end at a maximum of the likelihood that is nearer to odometry than the right one."""
-CLUTTER_SCALE_M = 0.15
+CLUTTER_SCALE_M = 0.5 * WIDE_SCALE_M
 """Least scale of the loss of points without a normal after such a step, metres: of a hedge, the robot then sees other
 points than before."""
 UNSURE_SUPPORTED = 0.2
@@ -48,7 +46,7 @@ NO_INFORMATION = np.zeros((3, 3))
 _DIRECTIONS = np.array([(0.0, 0.0, 0.0), *product((-1.0, 1.0), repeat=3)])
 
 
-POINT_SPACING_M = 0.05
+POINT_SPACING_M = CELL_M
 """Least distance between consecutive points of a scan that are matched, metres."""
 POINT_LIMIT = 180
 """Largest number of points of a scan that are matched."""
@@ -62,9 +60,6 @@ SEARCH_RADIUS_M = 1.0
 """Half side of the window of the correlative search, metres."""
 SEARCH_ANGLE_RAD = 0.5
 """Half angle of the window of the correlative search, radians."""
-SURPRISE = 4.0
-"""A match farther than this from odometry, in learned standard deviations of odometry's error, starts a correlative
-search."""
 UNLIKELY = 10.0
 """A match whose log-probability is lower than usual by this starts a correlative search."""
 
@@ -83,26 +78,34 @@ class TrackedScan(NamedTuple):
     """Times of the beams, and the motion as the scan was matched."""
 
 
+class TrackerState(NamedTuple):
+    """From where a tracker goes on."""
+
+    T_local_base: FloatArray
+    """Pose of the last scan, shape (3,)."""
+    T_odom_base: FloatArray | None = None
+    """The same by wheel odometry; None before the first scan."""
+    moved_m: float = 0.0
+    """Travel since the last accepted match, by odometry."""
+    turned_rad: float = 0.0
+    """Turn since the last accepted match, by odometry."""
+    matched_here: frozenset[tuple[float, float, float]] = frozenset()
+    """Mountings of the lasers whose scans were matched since the robot last moved."""
+    trust: OdometryTrust = OdometryTrust()
+    """Trust in odometry, learned from all matches."""
+    usual: float = math.nan
+    """Usual log-likelihood of a scan per point, learned from the latest matches; NaN before the first."""
+
+
 class TrackingResult(NamedTuple):
     """The match of one scan, and the state of the tracker after it (see ``ScanTracker.commit``)."""
 
     tracked: TrackedScan
-    explained: float
+    state: TrackerState
+    explained: float = math.nan
     """Share of the scan's points that lie on a surface of the running buffer, also if the match is not accepted."""
-    known: float
+    known: float = math.nan
     """Share of the scan's points near any surface; NaN, as ``explained``, if the scan was not matched."""
-    T_odom_base: FloatArray
-    """Pose of the scan by wheel odometry, shape (3,)."""
-    moved_m: float
-    """Travel since the last accepted match, by odometry; 0 if this one is accepted."""
-    turned_rad: float
-    """Turn since the last accepted match, by odometry; 0 if this one is accepted."""
-    matched_here: frozenset[tuple[float, float, float]]
-    """Mountings of the lasers whose scans were matched since the robot last moved."""
-    trust: OdometryTrust
-    """Trust in odometry, learned from all matches up to this one."""
-    usual: float
-    """Usual log-likelihood of a scan per point, learned from the latest matches; NaN before the first."""
 
     @property
     def quality(self) -> float:
@@ -120,37 +123,23 @@ class ScanTracker:
     def __init__(self, odometry: OdometryModel) -> None:
         self._odometry = odometry
         self._fields: list[tuple[SurfelField, int]] = []
-        self._T_local_base = np.zeros(3)
-        self._T_odom_base: FloatArray | None = None
-        self._moved_m = 0.0
-        self._turned_rad = 0.0
-        self._matched_here: frozenset[tuple[float, float, float]] = frozenset()
-        self._trust = OdometryTrust()
-        self._usual = np.nan
-
-    def track(self, scan: LaserScan) -> TrackedScan:
-        """Localize the next scan and continue from there."""
-        result = self.localize(scan)
-        self.commit(result)
-        return result.tracked
+        self._state = TrackerState(np.zeros(3))
 
     def localize(self, scan: LaserScan) -> TrackingResult:
         """Find the pose of the next scan; the tracker does not change before ``commit``."""
         # 1. Prediction: the last pose, moved by odometry.
-        T_local_guess, moved_m, turned_rad = self._predict(scan)
+        state, predicted = self._state, self._predicted(scan)
+        T_local_guess, moved_m, turned_rad = predicted.T_local_base, predicted.moved_m, predicted.turned_rad
+        by_odometry = TrackedScan(T_local_guess, NO_INFORMATION, None, scan.sweep)
         # The scans of a robot that has not moved since the last match are not matched.
         is_still = self._odometry.is_measured and moved_m < STILL_M and turned_rad < STILL_RAD
-        matched_here = (self._matched_here if is_still else frozenset()) | {scan.laser.T_base_laser}
-        if self._fields and is_still and matched_here == self._matched_here:
-            tracked = TrackedScan(T_local_guess, NO_INFORMATION, None, scan.sweep)
-            unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
-            return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
+        matched_here = (state.matched_here if is_still else frozenset()) | {scan.laser.T_base_laser}
+        if self._fields and is_still and matched_here == state.matched_here:
+            return TrackingResult(by_odometry, predicted)
         # 2. Scan to points.
         points = point_scan(scan.matched_ranges_m, scan.laser, scan.sweep)
         if not self._fields:
-            tracked = TrackedScan(T_local_guess, NO_INFORMATION, points, scan.sweep)
-            unmatched = np.nan, np.nan, scan.T_odom_base, moved_m, turned_rad
-            return TrackingResult(tracked, *unmatched, matched_here, self._trust, self._usual)
+            return TrackingResult(by_odometry._replace(scan=points), predicted._replace(matched_here=matched_here))
         # 3. Scan matching; a doubtful match starts a correlative search, also where the robot was if odometry may have
         #    jumped. A match against odometry needs evidence.
         error = odometry_error(moved_m, turned_rad, self._odometry)
@@ -159,38 +148,36 @@ class ScanTracker:
         match = self._match(points, thinned, T_local_guess, error, velocity)
         has_jumped = contradicts = False
         if match.explained < DOUBTFUL and self._is_long_step(T_local_guess):
-            other = self._match(points, thinned, self._T_local_base, error, velocity)
+            other = self._match(points, thinned, state.T_local_base, error, velocity)
             is_fixed = weakest_sigma_m(other.information) < SEARCH_SIGMA_M
             is_better = other.log_likelihood > match.log_likelihood + JUMP_GAIN
             if is_fixed and is_better and other.explained >= JUMP_SHARE:
-                match, T_local_guess, has_jumped = other, self._T_local_base, True
+                match, T_local_guess, has_jumped = other, state.T_local_base, True
         if self._odometry.is_measured:  # a prediction was right only as long as the motion went on as before
-            learned = over_steps(self._trust.scale(error), moved_m, moved_m - self._moved_m)
+            learned = over_steps(state.trust.scale(error), moved_m, moved_m - state.moved_m)
             match, contradicts = resolve(
                 thinned, self._fields[0][0], T_local_guess, match, learned, turned_rad, velocity
             )
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
         if match.explained < (UNSURE_SUPPORTED if self._is_unsure(error) else SUPPORTED):
-            tracked = TrackedScan(T_local_guess, NO_INFORMATION, points, scan.sweep)
-            rejected = match.explained, match.known, scan.T_odom_base, moved_m, turned_rad
-            return TrackingResult(tracked, *rejected, self._matched_here, self._trust, self._usual)
+            tracked = by_odometry._replace(T_local_base=T_local_guess, scan=points)
+            return TrackingResult(tracked, predicted._replace(T_local_base=T_local_guess), match.explained, match.known)
         tracked = TrackedScan(match.T_field_base, match.information, points, _corrected(scan.sweep, match.velocity))
         # 5. A good match shows how far odometry can be trusted, and every match how likely scans are here.
         innovation = se2.motion(T_local_guess, match.T_field_base)
         learns = _is_good(match, error) and not (contradicts or has_jumped)
-        trust = self._trust.learn(innovation, error) if learns else self._trust
-        usual = _learn_usual(self._usual, match.log_likelihood / max(1, len(thinned)))
-        accepted = match.explained, match.known, scan.T_odom_base, 0.0, 0.0
-        return TrackingResult(tracked, *accepted, matched_here, trust, usual)
+        accepted = TrackerState(
+            match.T_field_base,
+            scan.T_odom_base,
+            matched_here=matched_here,
+            trust=state.trust.learn(innovation, error) if learns else state.trust,
+            usual=_learn_usual(state.usual, match.log_likelihood / max(1, len(thinned))),
+        )
+        return TrackingResult(tracked, accepted, match.explained, match.known)
 
     def commit(self, result: TrackingResult) -> None:
         """Continue from the pose that ``localize`` found."""
-        self._T_local_base = result.tracked.T_local_base
-        self._T_odom_base = result.T_odom_base
-        self._moved_m, self._turned_rad = result.moved_m, result.turned_rad
-        self._matched_here = result.matched_here
-        self._trust = result.trust
-        self._usual = result.usual
+        self._state = result.state
 
     def insert(self, points: PointScan, T_local_base: FloatArray, laser_count: int = 1) -> None:
         """Add a keyscan to the running buffer.
@@ -212,36 +199,38 @@ class ScanTracker:
     @property
     def trust(self) -> OdometryTrust:
         """Trust in odometry, learned from all matches so far."""
-        return self._trust
+        return self._state.trust
 
     def T_odom_base(self, T_local_base: FloatArray) -> FloatArray:
         """Pose by odometry, shape (3,), of a scan that is predicted at ``T_local_base``, shape (3,)."""
-        last = np.zeros(3) if self._T_odom_base is None else self._T_odom_base
-        return se2.compose(last, se2.between(self._T_local_base, T_local_base))
+        last = np.zeros(3) if self._state.T_odom_base is None else self._state.T_odom_base
+        return se2.compose(last, se2.between(self._state.T_local_base, T_local_base))
 
     def empty_buffer(self) -> None:
         """Forget all keyscans: the pose goes on by odometry until the next one is inserted."""
         self._fields = []
 
-    def _predict(self, scan: LaserScan) -> tuple[FloatArray, float, float]:
-        """The last pose moved by odometry; travel and turn since the last accepted match."""
-        last = scan.T_odom_base if self._T_odom_base is None else self._T_odom_base
+    def _predicted(self, scan: LaserScan) -> TrackerState:
+        """The state moved by odometry to a scan that is not matched."""
+        state = self._state
+        last = scan.T_odom_base if state.T_odom_base is None else state.T_odom_base
         x, y, turn = motion = se2.motion(last, scan.T_odom_base)
-        moved_m, turned_rad = self._moved_m + math.hypot(x, y), self._turned_rad + abs(turn)
-        return se2.compose(self._T_local_base, motion), moved_m, turned_rad
+        return state._replace(
+            T_local_base=se2.compose(state.T_local_base, motion),
+            T_odom_base=scan.T_odom_base,
+            moved_m=state.moved_m + math.hypot(x, y),
+            turned_rad=state.turned_rad + abs(turn),
+        )
 
     def _explains(self, match: ScanMatch) -> bool:
-        """Whether a match explains the points in known area."""
         return match.explained >= DOUBTFUL * match.known
 
     def _is_long_step(self, T_local_guess: FloatArray) -> bool:
-        """Whether odometry moved so far since the last scan that it may have jumped."""
-        x, y, theta = se2.motion(self._T_local_base, T_local_guess)
+        x, y, theta = se2.motion(self._state.T_local_base, T_local_guess)
         return math.hypot(x, y) > LONG_STEP_M or abs(theta) > LONG_STEP_RAD
 
     def _is_unsure(self, error: OdometryError) -> bool:
-        """Whether odometry may have erred so much that a match has several starts."""
-        return self._odometry.is_measured and self._trust.position * error.position_m > UNSURE_M
+        return self._odometry.is_measured and self._state.trust.position * error.position_m > UNSURE_M
 
     def _velocity_information(self, sweep: Sweep | None) -> FloatArray:
         """Information of the velocity in a sweep, shape (3,), by odometry's error in the motion during the sweep."""
@@ -249,7 +238,7 @@ class ScanTracker:
             return FIXED
         duration_s, (x, y, theta) = sweep.duration_s, sweep.mean_velocity
         moved_m, turned_rad = duration_s * math.hypot(x, y), duration_s * abs(theta)
-        error = self._trust.scale(odometry_error(moved_m, turned_rad, self._odometry))
+        error = self._state.trust.scale(odometry_error(moved_m, turned_rad, self._odometry))
         position, heading = duration_s / error.position_m, duration_s / error.heading_rad
         return np.array((position**2, position**2, heading**2))
 
@@ -261,17 +250,16 @@ class ScanTracker:
         error: OdometryError,
         velocity: FloatArray,
     ) -> ScanMatch:
-        """Gauss-Newton from the guess; if the result is doubtful, a correlative search may find a likelier match."""
         field = self._fields[0][0]
-        learned = self._trust.scale(error)
+        learned = self._state.trust.scale(error)
         if self._is_unsure(error):
             match = _likeliest(thinned, field, T_local_guess, learned, velocity)
         else:
             match = match_scan(thinned, field, T_local_guess, error.information, velocity)
         innovation = se2.motion(T_local_guess, match.T_field_base)
         log_posterior = match.log_likelihood + learned.log_likelihood(innovation)
-        is_doubtful = not self._explains(match) or learned.mahalanobis2(innovation) >= SURPRISE**2
-        is_unlikely = log_posterior < self._usual * len(thinned) - UNLIKELY  # False before the first match
+        is_doubtful = not self._explains(match) or learned.mahalanobis2(innovation) >= FAR**2
+        is_unlikely = log_posterior < self._state.usual * len(thinned) - UNLIKELY  # False before the first match
         if not is_doubtful and not is_unlikely:
             return match
         window = SearchWindow(SEARCH_RADIUS_M, SEARCH_ANGLE_RAD)
@@ -302,7 +290,6 @@ def _likeliest(
 
 
 def _corrected(sweep: Sweep | None, velocity: FloatArray) -> Sweep | None:
-    """The sweep with its velocity moved by a correction, shape (3,)."""
     if sweep is None:
         return None
     (x, y, theta), (dx, dy, dtheta) = sweep.velocity, velocity.tolist()
@@ -314,15 +301,13 @@ def _bounded(velocity: float) -> float:
 
 
 def _learn_usual(usual: float, likelihood: float) -> float:
-    """The usual log-likelihood per point after one more match."""
     if math.isnan(usual):
         return likelihood
     return usual + USUAL_WEIGHT * min(max(likelihood - usual, -USUAL_STEP), USUAL_STEP)
 
 
 def _is_good(match: ScanMatch, error: OdometryError) -> bool:
-    """Whether a match is clear enough to judge odometry by it, whose error by the model is ``error``."""
-    explains = match.explained >= GOOD_SHARE * match.known and match.known >= GOOD_KNOWN
+    explains = match.explained >= CLEAR * match.known and match.known >= LEAST_KNOWN
     return explains and weakest_sigma_m(match.information) <= GOOD_SIGMA * error.position_m
 
 

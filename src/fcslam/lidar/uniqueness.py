@@ -17,13 +17,14 @@ from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Submap, agreement
+from fcslam.lidar.verification import ALIGNED_POINTS, ALIGNMENT_SCALE_M
 from fcslam.records import FloatArray
 
 Spectrum = NDArray[np.complex64]
 
 CELL_M = 0.25
 """Side of a cell of the exhaustive search."""
-WELL_INSIDE_M = 0.5
+WELL_INSIDE_M = 2.0 * CELL_M
 """A point in free space farther than this from any surface contradicts it, in the exhaustive search."""
 VIOLATION_WEIGHT = 2.0
 """Metres of explained surface that a metre of surface in free space cancels."""
@@ -33,9 +34,6 @@ PEAKS = 3
 """Best positions that are kept for each heading."""
 REFINED = 12
 """Best distinct transforms that are refined and scored exactly."""
-REFINEMENT_SCALE_M = 0.4
-_ALIGNED_POINTS = 800
-"""Points of a map that are aligned, about."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +64,9 @@ def align_map(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment:
         a, b: maps, each in the coordinate frame of its anchor.
         T_a_b: initial guess, shape (3,), metres and radians.
     """
-    step = max(1, len(b.surface) // _ALIGNED_POINTS)
+    step = max(1, len(b.surface) // (2 * ALIGNED_POINTS))
     sample = b.surface.only(np.arange(0, len(b.surface), step))
-    T_a_b = match_scan(sample, a.field, T_a_b, np.zeros((3, 3)), wide_scale_m=REFINEMENT_SCALE_M).T_field_base
+    T_a_b = match_scan(sample, a.field, T_a_b, np.zeros((3, 3)), wide_scale_m=ALIGNMENT_SCALE_M).T_field_base
     sides = agreement(b, a, T_a_b), agreement(a, b, se2.inverse(T_a_b))
     known = [side.overlap * len(surface) for side, surface in zip(sides, (b.surface, a.surface), strict=True)]
     violating = [side.violation * count for side, count in zip(sides, known, strict=True)]

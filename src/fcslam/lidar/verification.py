@@ -25,10 +25,10 @@ ALIGNMENT_SCALE_M = 0.4
 """A guess between submaps is worse than one between scans: the loss starts wider."""
 INFORMATIVE = 30.0
 """Least eigenvalue of the normal tensor of an informative closure; a corridor has less."""
-SYMMETRY_M, SYMMETRY_RAD = 0.15, 0.03
-"""Largest motion between the alignments of both directions."""
 CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD = 0.03, 0.006
 """Least standard deviations of a closure, however many points it has."""
+SYMMETRY_M, SYMMETRY_RAD = 5.0 * CLOSURE_SIGMA_M, 5.0 * CLOSURE_SIGMA_RAD
+"""Largest motion between the alignments of both directions."""
 LEAST_VARIANCE = CLOSURE_SIGMA_M**2, CLOSURE_SIGMA_M**2, CLOSURE_SIGMA_RAD**2
 
 
@@ -198,7 +198,6 @@ def _sample(surface: PointScan) -> PointScan:
 
 
 def _asymmetry(gap: FloatArray) -> Reason | None:
-    """The limit that the gap (3,) between the alignments of both directions reaches, if any."""
     if (gap_m := float(np.hypot(gap[0], gap[1]))) >= SYMMETRY_M:
         return Reason(ReasonCode.ASYMMETRIC, gap_m, SYMMETRY_M)
     if (gap_rad := abs(float(gap[2]))) >= SYMMETRY_RAD:
@@ -207,7 +206,6 @@ def _asymmetry(gap: FloatArray) -> Reason | None:
 
 
 def _shortfall(found: Agreement, gate: Gate, noise: Callable[[], float]) -> Reason | None:
-    """The first threshold of the gate that is not reached."""
     if found.explained < gate.explained:
         return Reason(ReasonCode.NOT_ENOUGH_EXPLAINED, found.explained, gate.explained)
     if found.violation > gate.violation and found.violation > (limit := _noisy_limit(found, gate, noise)):
@@ -220,7 +218,6 @@ def _shortfall(found: Agreement, gate: Gate, noise: Callable[[], float]) -> Reas
 
 
 def _noisy_limit(found: Agreement, gate: Gate, noise: Callable[[], float]) -> float:
-    """Largest violation allowed, given the noise of the submaps."""
     if found.violation > NOISE_FACTOR * gate.violation:
         return gate.violation
     return min(NOISE_FACTOR * gate.violation, max(gate.violation, noise()))

@@ -264,7 +264,6 @@ def _information(graph: PoseGraph, poses: FloatArray, rows: NDArray[np.int64]) -
 
 
 def _sampled(poses: FloatArray) -> NDArray[np.int64]:
-    """Keyscans about a metre apart, the first one among them; farther apart if they are too many."""
     spacing_m = CELL_M
     while True:
         squares = np.floor(poses[:, :2] / spacing_m).astype(np.int64)
@@ -275,7 +274,6 @@ def _sampled(poses: FloatArray) -> NDArray[np.int64]:
 
 
 def _known_squares(occupancy: OccupancyMap) -> FloatArray:
-    """Centres of the squares of ``CELL_M`` with known cells, shape (C, 2)."""
     rows, columns = np.nonzero(occupancy.cells)
     x, y = (
         np.floor((origin + occupancy.resolution_m * (cells + 0.5)) / CELL_M).astype(np.int64)

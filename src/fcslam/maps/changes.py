@@ -97,7 +97,6 @@ def _latest_change(maps: Sequence[OccupancyMap]) -> NDArray[np.int64]:
 def _regions(
     kind: str, mask: Mask, latest: NDArray[np.int64], now: OccupancyMap, periods: Sequence[Period]
 ) -> tuple[list[ChangedRegion], Mask]:
-    """The regions of a mask that are large enough, and their cells."""
     side = now.resolution_m
     count, labels = cv2.connectedComponents(
         grown(mask, max(1, round(JOINED_M / (2.0 * side)))).astype(np.uint8), connectivity=8

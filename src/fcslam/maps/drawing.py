@@ -72,8 +72,6 @@ _APPEARED, _DISAPPEARED = len(Occupancy), len(Occupancy) + 1
 
 @dataclass(frozen=True, slots=True)
 class _Viewport:
-    """The visible part of the map, and the transform from map coordinates to pixels."""
-
     cells: Cells  # row 0 at the lowest y
     corner_xy: FloatArray  # lower left corner in map
     cell_m: float
@@ -181,7 +179,6 @@ def _shown_box(fused: OccupancyMap, trajectories: Iterable[FloatArray]) -> tuple
 
 
 def _finite(points: FloatArray) -> FloatArray:
-    """Finite (x, y) of points (N, 2+), shape (M, 2)."""
     xy = np.asarray(points, dtype=np.float64)[:, :2]
     return np.asarray(xy[np.isfinite(xy).all(axis=1)])
 
@@ -293,6 +290,5 @@ def closure_png(
 
 
 def _pixels(points: FloatArray, reach_m: float) -> NDArray[np.int64]:
-    """Column and row of the points in the picture, shape (M, 2)."""
     inside = points[(np.abs(points) < reach_m).all(axis=1)]
     return np.asarray(np.rint((inside * (1.0, -1.0) + reach_m) * ((SIDE_PX - 1) / (2.0 * reach_m))).astype(np.int64))

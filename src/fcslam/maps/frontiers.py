@@ -152,7 +152,6 @@ def search_grid(occupancy: OccupancyMap) -> tuple[Cells, Cells, float, tuple[flo
 
 
 def _beside(cells: Cells) -> Cells:
-    """Cells that share a side with one of these."""
     near = np.zeros_like(cells)
     near[1:] |= cells[:-1]
     near[:-1] |= cells[1:]

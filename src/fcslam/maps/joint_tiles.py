@@ -164,7 +164,6 @@ def tiled_map(tiles: Mapping[Number, Cells], resolution_m: float) -> OccupancyMa
 
 
 def _tiles_of(occupancy: OccupancyMap) -> Iterator[tuple[Number, bytes]]:
-    """The tiles of a map that have a known cell."""
     whole = padded(occupancy)
     first = [round(edge / whole.resolution_m / TILE) for edge in whole.origin_xy[::-1]]
     rows, columns = (size // TILE for size in whole.cells.shape)

@@ -131,7 +131,6 @@ def _decoded(image: bytes) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
 
 
 def _white(image: bytes, dtype: np.dtype[Any]) -> int:
-    """The largest value of a pixel; cv2 scales only an ASCII PGM of 8 bits."""
     header = _PGM.match(image)
     if header is None:
         return np.iinfo(dtype).max

@@ -26,8 +26,6 @@ class RobotPath(NamedTuple):
 
 
 class _Suspects(NamedTuple):
-    """Points of scans that lie on one robot."""
-
     robot: str
     scans: NDArray[np.int64]  # (K,)
     beams: NDArray[np.int64]  # (K,)
@@ -119,7 +117,6 @@ def _whereabouts(paths: Sequence[RobotPath], stamps: FloatArray) -> tuple[FloatA
 
 
 def _distance(points: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
-    """Distance of points (..., 2) to lines between two ends (..., 2)."""
     along = end - begin
     length = np.maximum((along**2).sum(axis=-1), 1e-12)
     share = np.clip(((points - begin) * along).sum(axis=-1) / length, 0.0, 1.0)

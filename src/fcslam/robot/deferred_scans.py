@@ -17,7 +17,6 @@ from fcslam.lidar.lost import (
     can_decide,
     is_doubtful,
     is_lost,
-    rode,
 )
 from fcslam.lidar.tracker import TrackingResult
 from fcslam.records import CameraImage, LaserScan
@@ -117,7 +116,7 @@ class DeferredScans:
 
     def _outcome(self, scans: list[LaserScan], session: Session) -> Outcome:
         if self._cabin.is_leaving and not self._gap_s:
-            return Outcome.OTHER_FLOOR if rode(scans, session.lidar, self._cabin.closed_s) else Outcome.SAME_PLACE
+            return Outcome.OTHER_FLOOR if is_lost(scans, session.lidar, self._cabin.closed_s) else Outcome.SAME_PLACE
         if not self._gap_s and is_lost(scans, session.lidar):
             return Outcome.SAME_PLACE_OTHER_MAP if session.drove_on(scans) else Outcome.OTHER_PLACE
         return Outcome.SAME_PLACE if session.relocate(self._records, self._gap_s) else Outcome.OTHER_PLACE

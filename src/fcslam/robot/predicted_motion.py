@@ -193,7 +193,7 @@ class PredictedMotion:
             self._own_map.process(_scans(deferred)[0])
         scan, own = self.track(scan, self._own_map, lambda tracked: se2.compose(origin, tracked.T_local_base))
         scan = self._prediction.follow(scan, se2.compose(origin, own.tracked.T_local_base), own.tracked.sweep)
-        self._own_map.process(scan, own._replace(T_odom_base=scan.T_odom_base))
+        self._own_map.process(scan, own._replace(state=own.state._replace(T_odom_base=scan.T_odom_base)))
         return scan
 
     def relocate(self, deferred: Deferred, frontend: LidarFrontend, gap_s: float) -> bool:

@@ -112,7 +112,7 @@ class Session:
         """Whether odometry without a jump and the scans agree that the robot drove to where doubtful scans are."""
         if isinstance(self.motion, PredictedMotion) or self.motion.jumps != self._jumps:
             return False
-        return drove_on(self._explained, scans, self.lidar)
+        return drove_on(self._explained, scans, self.lidar.odometry, self.lidar.trust)
 
     def relocate(self, deferred: Deferred, gap_s: float) -> bool:
         """Whether doubtful scans that do not contradict the map show the place before them; see ``PredictedMotion``."""

@@ -158,7 +158,6 @@ def read_metrics(path: Path, within: Path | None = None) -> dict[str, Metric]:
 
 
 def _number(value: object) -> float:
-    """The number itself: a count stays an integer."""
     if not isinstance(value, int | float):
         raise TypeError(f"{value!r} is not a number")
     return value
