@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.errors import SourceError
 from fcslam.records import Beams, LaserModel, LaserScan, frozen
-from fcslam.sources import BagOptions, Fault, FaultCount, open_fleet, open_source, write_bag
+from fcslam.sources import BagOptions, Fault, FaultCount, open_source, write_bag
 from tests.carmen_logs import write_carmen
 from tests.sources.bag_messages import drive, mounted, odom, pose_at, scan, tf
 from tests.sources.bag_messages import save as save_bag
@@ -200,35 +200,3 @@ def test_a_bag_holds_several_lasers(tmp_path):
     mountings = np.array([scan.laser.T_base_laser for scan in read])
     np.testing.assert_allclose(mountings, [(0.0, 0.0, 0.0), (-0.3, 0.0, math.pi)] * 6, atol=1e-9)
     assert all(np.array_equal(before.ranges_m, after.ranges_m) for before, after in zip(written, read, strict=True))
-
-
-# Topics of a fleet
-
-
-def renamed(said, **topics):
-    return [message._replace(topic=topics.get(message.topic.strip("/"), message.topic)) for message in said]
-
-
-def test_a_fleet_is_read_from_the_topics_that_all_bags_have(tmp_path):
-    more = [scan(100.05 + 0.05 * k, (1.0,) * 8, topic="/stable_scan", frame="laser") for k in range(60)]
-    bags = [
-        (save_bag(tmp_path / "anna.bag", [*drive(20), *more]), None),
-        (save_bag(tmp_path / "ben.bag", renamed([*drive(20), *more], scan="/lidar")), None),
-    ]
-    sources = open_fleet(bags)
-    notes = [note for source in sources for note in source.survey().notes]
-    assert [len(scans_of(source)) for source in sources] == [60, 60]
-    assert notes == [
-        "all bags: reads laser scans from /stable_scan, not from /lidar, /scan (--sensors scan-topic chooses)"
-    ]
-    assert len(scans_of(open_source(bags[0][0]))) == 20, "alone, the name decides"
-
-
-def test_a_fleet_without_a_common_topic_reads_each_bag_by_itself(tmp_path):
-    bags = [
-        (save_bag(tmp_path / "anna.bag", drive(20)), "a"),
-        (save_bag(tmp_path / "ben.bag", renamed(drive(20), scan="/lidar")), "b"),
-    ]
-    sources = open_fleet(bags)
-    assert [source.name for source in sources] == ["a", "b"]
-    assert [len(scans_of(source)) for source in sources] == [20, 20]

@@ -129,7 +129,6 @@ class LivePlanner:
         return LivePlan(rig_of(first, farthest_m, mountings, camera), lasers, self._edge)
 
     def _find_odometry(self, is_late: bool) -> None:
-        """Find the odometry in tf, on the way up from the laser; only without a way, elsewhere."""
         if self._topics.odometry is not None or self._edge is not None or not self._first[0]:
             return
         names = self._first[0][-1].frame, self._options.odom_frame, self._options.base_frame

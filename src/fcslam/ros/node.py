@@ -197,7 +197,6 @@ class RobotNode:
             self._outputs.closures(stamp_ns, self._robot.closures())
 
     def _publish_joint_map(self, only_changes: bool) -> bool:
-        """Publish the joint map as it is now, as ``Outputs.map``. False before the robot has one."""
         joint = self._robot.joint_map()
         if joint is None or self._pose is None:
             return False
@@ -274,7 +273,6 @@ class RobotNode:
             due_s = max(due_s + period_s, time.monotonic() - period_s)
 
     def _publish_maps(self) -> None:
-        """Publish diagnostics every second and the map every interval."""
         due_s = 0.0
         drawn = 0 if self._suggest_pose is None else -1  # a finished map is there before the first scan
         while not self._stop.wait(1.0):
@@ -325,7 +323,6 @@ class RobotNode:
             )
 
     def _take_name(self, payload: bytes) -> None:
-        """Save the map soon; the message is its name, else it is the robot's."""
         try:
             name = self._codec.decode(payload, STRING).data or self._robot.name
             if not NAME.fullmatch(name):  # anybody on the network may send it
@@ -396,7 +393,6 @@ class RobotNode:
 
 
 def _mismatch(mine: Endpoint, other: Endpoint) -> str:
-    """Why one of two endpoints of a topic does not get the messages of the other; empty if it does."""
     if mine.kind != other.kind:
         return f"{mine.topic}: another node takes it as {other.kind}, and not as {mine.kind}"
     if mine.publishes == other.publishes:

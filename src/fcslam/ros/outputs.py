@@ -78,8 +78,6 @@ class Region(NamedTuple):
 
 @dataclass(slots=True)
 class _Shown:
-    """What subscribers of a map have."""
-
     whole: Grid | None = None
     """The newest map that was published whole."""
     newest: Grid | None = None
@@ -363,7 +361,6 @@ def changed_region(before: Grid, after: Grid) -> Region | None:
 
 
 def _bounding(first: Region, second: Region) -> Region:
-    """The smallest rectangle around two."""
     x, y = min(first.x, second.x), min(first.y, second.y)
     right, top = (max(first[k] + first[k + 2], second[k] + second[k + 2]) for k in (0, 1))
     return Region(x, y, right - x, top - y)
@@ -385,7 +382,6 @@ def _is_same(before: Grid, after: Grid) -> bool:
 
 
 def _steps(poses: FloatArray) -> Sequence[int]:
-    """Indices of poses (N, 3) that are a step apart, and of the last one."""
     length_m = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
     step_m = max(PATH_STEP_M, length_m / LONGEST_PATH)
     kept: list[int] = []

@@ -78,8 +78,6 @@ def _part_of(output: Path) -> Path:
 
 
 class _Recording:
-    """A bag (MCAP) of raw messages."""
-
     def __init__(self, place: Path) -> None:
         from rosbags import rosbag2
 

@@ -58,8 +58,6 @@ _IMAGES_KEPT = 200
 
 
 class _Patience:
-    """Says when something is awaited for too long."""
-
     def __init__(self, longest_s: float) -> None:
         self._longest_s = longest_s
         self._since_s: float | None = None
@@ -192,7 +190,6 @@ class LiveSensors:
             yield fix
 
     def _keep_early(self, number: int, item: Message) -> None:
-        """Keep a message until the mounting is known; of images, the newest."""
         self._early.append((number, item))
         if isinstance(item, ImageMessage):
             images = [index for index, (_, each) in enumerate(self._early) if isinstance(each, ImageMessage)]
@@ -200,7 +197,6 @@ class LiveSensors:
                 del self._early[images[0]]
 
     def _decoded(self, topic: str, payload: bytes, received_ns: int) -> list[Message]:
-        """Raises ValueError if the message is invalid."""
         kind = self._topics.kinds[topic]
         content = self._codec.decode(payload, kind)
         if topic in self._topics.scans:
@@ -280,7 +276,6 @@ class LiveSensors:
             )
 
     def _has_stepped_back(self, stamp: float) -> bool:
-        """Whether the clock of the scans stepped back and stays there, as when a bag is played again."""
         newest = self._newest_stamp
         if newest is None or stamp >= newest - MAX_STEP_BACK_S:
             self._misplaced = 0

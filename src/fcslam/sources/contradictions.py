@@ -37,8 +37,6 @@ FEWEST_ALTERNATING, ALTERNATING = 10, 0.1
 
 
 class _Seen(NamedTuple):
-    """A scan and the odometry at it."""
-
     scan: LaserScan
     T_odom_base: Pose
 
@@ -156,13 +154,11 @@ def _is_still(before: Pose, after: Pose) -> bool:
 
 
 def _motion(before: Pose, after: Pose) -> tuple[float, float]:
-    """Distance and turn by odometry."""
     (x0, y0, theta0), (x1, y1, theta1) = before, after
     return hypot(x1 - x0, y1 - y0), abs(remainder(theta1 - theta0, tau))
 
 
 def _changed_share(before: LaserScan, after: LaserScan) -> float:
-    """Share of the common returns that measure something else; NaN if there are too few."""
     laser, was = after.laser, before.laser
     beams = np.rint((laser.angles_rad() - was.angle_min_rad) / was.angle_increment_rad).astype(np.intp)
     inside = (beams >= 0) & (beams < was.beam_count)

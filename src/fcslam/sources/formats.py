@@ -12,7 +12,7 @@ from fcslam.errors import SourceError
 from fcslam.records import LaserScan
 from fcslam.sources.bags.container import ZSTD, is_bag, parts_of
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.rosbag import RosBag, as_fleet
+from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_errors
 from fcslam.sources.logs.carmen import is_carmen
 from fcslam.sources.logs.textlog import TextLog
@@ -43,8 +43,7 @@ def open_fleet(
 ) -> list[Source]:
     """Open the recordings of one fleet, each with its robot's name, as ``open_source`` does.
 
-    A bag of several robots gives each of them. Where ``options`` leave a choice of topics, all bags of one robot are
-    read from the same ones if all have them. Sources that are open already stay as they are.
+    A bag of several robots gives each of them. Sources that are open already stay as they are.
     """
     sources: list[Source] = []
     given: list[tuple[Path, str, Source]] = []
@@ -60,11 +59,7 @@ def open_fleet(
                     raise SourceError(f"{path}: is the recording of '{other.name}' already; give each recording once")
             given.append((file, which, each))
             sources.append(each)
-    bags = [source for _, _, source in given if isinstance(source, RosBag)]
-    if len(bags) < 2 or len({file for file, _, _ in given}) < len(given):  # robots of one bag differ in their topics
-        return sources
-    agreed = dict(zip(map(id, bags), as_fleet(bags, options), strict=True))
-    return [agreed.get(id(source), source) for source in sources]
+    return sources
 
 
 def _files(recording: Path) -> list[Path]:
@@ -132,7 +127,6 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
 
 
 def _robot_name(path: Path) -> str:
-    """The name of the file, or the common beginning of the names of several."""
     names = [robot_name(path)] if os.path.isdir(path) else list(map(robot_name, parts_of(path)))
     return os.path.commonprefix(names).strip("._-") or names[0]  # noqa: RUF071  of letters
 
@@ -163,7 +157,6 @@ def format_of(path: Path) -> str:
 
 
 def _refuse_others(path: Path, content: bytes) -> None:
-    """Raise SourceError for what is known not to be a recording, or for such a file in the folder of a bag."""
     for at, magic, what in _OTHERS:
         if content.startswith(magic, at):
             raise SourceError(f"{path}: {what}")

@@ -1,7 +1,6 @@
 """Checks of encoded images without decoding: file type and size."""
 
-import struct
-from struct import unpack_from
+from io import BytesIO
 
 from fcslam.records import CameraModel
 
@@ -15,13 +14,6 @@ _FAR = 1e6
 _UNIT = 1e-6
 """Largest deviation of a quaternion's squared length from 1."""
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-_PNG_SIZE = 16
-"""Offset of width and height in a PNG file."""
-_SEGMENT = 0xFF
-_FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""JPEG markers SOF0 to SOF15 (without DHT, JPG and DAC), which hold the size."""
-_BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})
-"""JPEG markers without a length: TEM, RST0 to RST7 and SOI."""
 
 
 def image_suffix(encoded: bytes) -> str:
@@ -34,15 +26,14 @@ def image_suffix(encoded: bytes) -> str:
 
 
 def image_size(encoded: bytes) -> tuple[int, int]:
-    """Width and height in pixels from the header; raises ValueError for an invalid header."""
+    """Width and height in pixels from the header; raises ValueError if there is none of a JPEG or PNG file."""
+    from PIL import Image
+
     try:
-        if image_suffix(encoded) == "png":
-            width, height = unpack_from(">II", encoded, _PNG_SIZE)
-        else:
-            width, height = _jpeg_size(encoded)
-    except struct.error as error:
-        raise ValueError("the image ends in its header") from error
-    return width, height
+        with Image.open(BytesIO(encoded), formats=("JPEG", "PNG")) as image:
+            return image.size
+    except Exception as error:  # Pillow's formats raise errors of many types
+        raise ValueError("the header is not that of a JPEG or PNG file") from error
 
 
 def check_image(encoded: bytes, camera: CameraModel) -> None:
@@ -67,22 +58,3 @@ def check_camera(camera: CameraModel) -> None:
         raise ValueError("the camera's position must be finite")
     if not abs(sum(value * value for value in rotation) - 1.0) < _UNIT:
         raise ValueError("the camera's quaternion must have length 1")
-
-
-def _jpeg_size(encoded: bytes) -> tuple[int, int]:
-    """Width and height from the first frame header, after skipping the segments before it."""
-    at = 2
-    while True:
-        fill, marker = unpack_from(">BB", encoded, at)
-        if fill != _SEGMENT:
-            raise ValueError("no JPEG segment where one must be")
-        if marker in _FRAME_HEADERS:
-            height, width = unpack_from(">HH", encoded, at + 5)
-            return width, height
-        if marker == _SEGMENT:
-            at += 1
-        elif marker in _BARE_MARKERS:
-            at += 2
-        else:
-            (length,) = unpack_from(">H", encoded, at + 2)
-            at += 2 + length

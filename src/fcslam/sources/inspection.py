@@ -160,7 +160,6 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
 
 
 def _bag_contents(bag: DecodedBag) -> BagContents:
-    """What is in all messages; those that cannot be decoded count as the others."""
     topics, edges, frames = [], dict[Link, None](), {}
     for topic, its in bag.census.items():
         first_ns, last_ns = its.span_ns

@@ -81,8 +81,6 @@ class OdometryUpdates:
 
 
 class _Track(NamedTuple):
-    """Poses by odometry around a sweep, in the order of their stamps."""
-
     stamps: np.ndarray
     poses: np.ndarray
 
@@ -118,7 +116,6 @@ def moving_sweep(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> Swe
 
 
 def _around(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> _Track | None:
-    """The readings from one before the sweep to one after it; None if there are fewer than two."""
     first_s, last_s = stamp + min(0.0, sweep.first_s, sweep.last_s), stamp + max(0.0, sweep.first_s, sweep.last_s)
     near: list[Reading] = []
     for reading in reversed(readings):

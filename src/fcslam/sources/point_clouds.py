@@ -267,7 +267,6 @@ def _lowest_plane(points: FloatArray, is_height_known: bool, largest_tilt_rad: f
 
 
 def _fitted(floor: Floor, points: FloatArray) -> Floor | None:
-    """The plane through the points of a floor, by least squares; None if they are few or on a line."""
     own = points[np.abs(points @ floor.normal - floor.distance_m) < FLOOR_NOISE_M]
     if len(own) < _FEWEST_ON_FLOOR:
         return None
@@ -349,7 +348,6 @@ class _Turn(NamedTuple):
 
 
 def _turn(xy: FloatArray, times_s: FloatArray) -> _Turn | None:
-    """How the scanner turns; None if it measures its directions in another order, or all at once."""
     if len(times_s) < _SLOTS or not times_s.max() > times_s.min():
         return None
     begin_s, end_s = float(times_s.min()), float(times_s.max())

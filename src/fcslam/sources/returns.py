@@ -208,7 +208,6 @@ def _returns(sample: _Sample) -> FloatArray:
 
 
 def _overflows(samples: Sequence[_Sample]) -> bool:
-    """Whether the ranges go on at 0 after the largest one."""
     largest = max((_returns(one).max(initial=0.0) for one in samples), default=0.0)
     tops, ends = 0, []
     for sample in samples:

@@ -334,7 +334,6 @@ def _counted(topic: TopicCensus, message: StoredMessage, ros1: bool) -> Content 
 
 
 def _decode(payload: bytes, kind: str, ros1: bool) -> Any:
-    """Decode a message to an object of rosbags; raises ValueError if the bytes are not a message of its type."""
     if not ros1 and payload.startswith(ZSTD):
         payload = unpack(payload, "zstd")
     return MessageCodec(ros1).decode(payload, kind)

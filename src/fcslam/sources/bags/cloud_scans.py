@@ -104,7 +104,6 @@ class BagScans:
             ) from error
 
     def _levelled(self, topic: Topic, frame: str, mounting: CloudMounting) -> CloudMounting:
-        """The mounting, corrected with a note if the floor leans in most clouds."""
         found = leaning(self._some_clouds(topic, frame), mounting)
         if found is None:
             return mounting

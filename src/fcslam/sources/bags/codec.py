@@ -82,7 +82,6 @@ class MessageCodec:
         return self.store.types[name](**zeros, **fields)
 
     def _zero(self, node: "Nodetype", of: Any) -> Any:
-        """A zero of a type as rosbags describes it."""
         from rosbags.interfaces import Nodetype
 
         if node == Nodetype.NAME:

@@ -107,7 +107,6 @@ class OdometryPairing:
             yield _with_pose(queue.popleft(), readings)
 
     def _is_late(self, stamp: float) -> bool:
-        """Whether a reading was recorded after later ones; several in a row are of a clock that stepped back."""
         is_back = bool(self._readings) and 0.0 < self._readings[-1].stamp - stamp <= _LATE_S
         self._late = self._late + 1 if is_back else 0
         return 0 < self._late <= _MOST_LATE
@@ -201,7 +200,6 @@ def _insert(readings: deque[OdometryReading], late: OdometryReading) -> None:
 
 
 def _look_back(readings: deque[OdometryReading], stamp: float) -> _PoseMatch | None:
-    """The pose if the readings so far determine it; None to wait for later ones."""
     if not readings or stamp > readings[-1].stamp:
         return None
     if stamp == readings[-1].stamp:

@@ -22,7 +22,7 @@ from fcslam.sources.bags.pairing import Message
 from fcslam.sources.bags.rig import usual_scan
 from fcslam.sources.bags.robots import BagRobot, listed, usual
 from fcslam.sources.bags.sectors import are_sectors, cloud_sector_rad, joined_turns
-from fcslam.sources.bags.topics import Candidates, KnownTopics, Topics, choose_topics, find_candidates
+from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.gate import SCANS_THAT_VOTE
@@ -141,12 +141,6 @@ class BagPlan(NamedTuple):
         return [reading._replace(stamp=reading.stamp - late_s) for reading in readings]
 
 
-def candidates_of(robot: BagRobot) -> Candidates:
-    """The topics of a robot that can be read."""
-    found = find_candidates(_known_topics(robot), partial(_view_rad, robot), partial(_has_images, robot))
-    return found._replace(measured=[topic for topic in found.measured if not _odometry_error(robot, topic)])
-
-
 def plan_of(robot: BagRobot, options: BagOptions) -> BagPlan:
     """Plan how a robot of a bag is read."""
     return _Planner(robot, options).plan()
@@ -200,7 +194,6 @@ class _Planner:
         return RecordedLaser(topic, usual_scan(joined_turns(first) if is_in_sectors else first), frame, is_in_sectors)
 
     def _first_error(self, topic: Topic) -> str:
-        """The fault of the first scan of a topic, in brackets."""
         for message in islice(self._bag.read([topic]), 1):
             try:
                 self._scans.scan(message, self._options.cloud_band)
@@ -209,7 +202,6 @@ class _Planner:
         return ""
 
     def _odometry(self, frame: str) -> OdometryInput | None:
-        """The odometry that is read; ``frame`` is that of the first laser."""
         if self._options.odom_topic == NO_ODOMETRY:
             return None
         for candidate in self._odometry_candidates(frame):
@@ -248,7 +240,6 @@ class _Planner:
         return [topic for topic in self._topics.odometry if topic.type == ODOMETRY]
 
     def _base_frame(self, topic: Topic) -> str | None:
-        """The frame of the base on a topic of odometry that has several."""
         frames = [frame for frame in usual(self._bag.census[topic].frames) if frame]
         chosen = self._options.base_frame or self._robot.base_frames.get(topic.name)
         if len(frames) < 2:
@@ -261,7 +252,6 @@ class _Planner:
         )
 
     def _base_frame_of(self, frame: str) -> str:
-        """The base of the robot with ``frame``, before its lasers are known."""
         bases = [self._options.base_frame]
         for topic in self._measured:
             bases += [self._base_frame(topic), *self._bag.census[topic].frames]
@@ -270,7 +260,6 @@ class _Planner:
         return next(filter(None, (*bases, *(link or ())[1:], *usual_ones)), USUAL_BASES[-1])
 
     def _scans_change(self) -> bool:
-        """Whether the scans show that the robot moves: some scan measures something else than the first."""
         found = self._scans.of(self._topics.scans[0])
         first = next(found, None)
         return first is not None and any(
@@ -279,8 +268,6 @@ class _Planner:
         )
 
     def _clock_ahead_s(self, odometry: OdometryInput) -> float:
-        """The clock of the odometry against that of the scans by the times of recording; 0 if they are alike."""
-
         def scan_ends(message: BagMessage) -> list[float]:
             return [self._scans.scan(message, self._options.cloud_band).end]
 
@@ -314,15 +301,12 @@ def _known_topics(robot: BagRobot) -> KnownTopics:
 
 
 def _odometry_error(robot: BagRobot, topic: Topic) -> str:
-    """The fault of the first message of a topic of odometry; empty if one of the first ones is valid."""
     first = [message.decoded for message in islice(robot.bag.read([topic]), _READINGS_TRIED)]
     is_bad = topic.type == ODOMETRY and first and all(isinstance(each, ValueError) for each in first)
     return str(first[0]) if is_bad else ""
 
 
 def _has_images(robot: BagRobot, topic: Topic) -> bool:
-    """Whether one of the first messages is a readable image; depth images are not."""
-
     def image(message: BagMessage) -> ImageMessage:
         return image_of(message.content, topic.type, message.bag_time_ns)
 
@@ -330,7 +314,6 @@ def _has_images(robot: BagRobot, topic: Topic) -> bool:
 
 
 def _view_rad(robot: BagRobot, topic: Topic) -> float:
-    """The field of view of the first valid scan of a topic; 0 without one; a full turn of a point cloud."""
     if topic.type not in LASER_SCANS:
         return tau
     scans = valid(robot.bag.read([topic]), lambda message: message.content)

@@ -261,7 +261,6 @@ def _kind(stated: str, encoding: str) -> str:
 
 
 def _ros1_fields(content: bytes) -> dict[bytes, bytes]:
-    """The fields of a record's header."""
     fields, at = dict[bytes, bytes](), 0
     while at < len(content):
         end = at + 4 + int.from_bytes(content[at : at + 4], "little")
@@ -287,7 +286,6 @@ def _exactly(file: BinaryIO, size: int) -> bytes:
 
 
 def _text(content: bytes, at: int) -> tuple[str, int]:
-    """A string of MCAP, and where it ends."""
     start = at + 4
     end = start + int.from_bytes(content[at:start], "little")
     if end > len(content):

@@ -171,5 +171,4 @@ def mounted_camera(
 
 
 def _turned_beams(beams: Beams, upside_down: bool) -> Beams:
-    """The beams of a laser that is mounted upside down, as seen from above."""
     return beams._replace(angle_min_rad=-(beams.angle_min_rad + beams.span_rad)) if upside_down else beams

@@ -102,7 +102,6 @@ def robots_of(bag: DecodedBag, options: BagOptions) -> tuple[BagRobot, ...]:
 
 
 def _is_apart(member: _Member, robot: _Member) -> bool:
-    """Whether a namespace with a tf of its own is beside that of a robot."""
     return bool(robot.space and member.space) and not set(member.transforms) & set(robot.transforms)
 
 
@@ -221,7 +220,6 @@ def _only_robot(bag: DecodedBag, members: Sequence[_Member], options: BagOptions
 
 
 def _lost_scans(bag: DecodedBag, robots: Sequence[_Member], members: Sequence[_Member]) -> tuple[str, ...]:
-    """Notes on scans that are of none of several robots."""
     notes = []
     for member in members:
         for topic, frames in () if member in robots else member.scan_frames.items():
@@ -285,11 +283,9 @@ def _prefix(frame: str) -> str:
 
 
 def _namespaces(topic: Topic) -> list[str]:
-    """The namespaces around a topic, the innermost first; the last is empty."""
     parts = slashed(topic.name).split("/")[:-1]
     return ["/".join(parts[:end]) for end in range(len(parts), 0, -1)]
 
 
 def _innermost(topic: Topic, spaces: set[str]) -> str:
-    """The innermost of the namespaces ``spaces`` around a topic; empty if the topic is in none of them."""
     return next((space for space in _namespaces(topic) if space in spaces), "")

@@ -5,7 +5,7 @@ counted. A robot that stands still is accepted, because a topic shows that there
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain
@@ -21,7 +21,7 @@ from fcslam.sources.bags.fixes import FIX_INTERVAL_S, fix_of, fix_topics
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, BeamsError, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
-from fcslam.sources.bags.plan import BagPlan, candidates_of, plan_of
+from fcslam.sources.bags.plan import BagPlan, plan_of
 from fcslam.sources.bags.reader import Numbered, ReadLaser, SensorReader
 from fcslam.sources.bags.rig import (
     MountedSensor,
@@ -34,7 +34,6 @@ from fcslam.sources.bags.rig import (
     tilt_note,
 )
 from fcslam.sources.bags.robots import BagRobot, robot_of, robots_of, slashed
-from fcslam.sources.bags.topics import agree_on_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Mounting
 from fcslam.sources.contradictions import Alternation, ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
@@ -52,8 +51,6 @@ _OF_CLOUDS = "that its points are in metres, its mounting in tf and the heights 
 
 
 class _Reading(NamedTuple):
-    """Summary of a bag, and how to read it."""
-
     survey: Survey
     rig: Rig
     band: CloudBand
@@ -146,7 +143,6 @@ class RosBag:
 
     @cached_property
     def _fixes(self) -> tuple[tuple[GnssFix, ...], Faults]:
-        """The fixes of satellite navigation in the order of their stamps, a second apart, and faults of the others."""
         audit, found = _audit(), list[GnssFix]()
         for message in self.bag.read(fix_topics(self.robot)[:1]):
             try:
@@ -166,7 +162,6 @@ class RosBag:
     def _entries(
         self, audit: Audit, band: CloudBand, errors: dict[str, str] | None = None, with_images: bool = False
     ) -> Iterator[Numbered]:
-        """The consistent entries of a pass; ``errors`` gets the first fault of each topic."""
         plan, errors = self.plan, {} if errors is None else errors
         lasers = [ReadLaser(laser.first.beams, laser.is_in_sectors) for laser in plan.lasers]
         reader = SensorReader(lasers, plan.odometry is not None, audit)
@@ -186,7 +181,6 @@ class RosBag:
         yield from reader.finish()
 
     def _count_broken_transforms(self, audit: Audit, errors: dict[str, str]) -> None:
-        """Count the transforms that no pass over the scans reads."""
         read = () if self.plan.odometry is None else self.plan.odometry.topics
         for topic in self.plan.topics.transforms:
             broken = self.bag.census[topic].broken
@@ -196,7 +190,6 @@ class RosBag:
 
     @cached_property
     def _reading(self) -> _Reading:
-        """Summary from one pass over the whole bag; rejects a bag that cannot be mapped."""
         audit, errors, plan = _audit(), dict[str, str](), self.plan
         tree, lasers, band = plan.tree, plan.lasers, self._options.cloud_band
         scans, odometry = PathSummary(), PathSummary()
@@ -381,7 +374,6 @@ class RosBag:
         return [self._of(robot, name) for robot in robots]
 
     def _of(self, robot: BagRobot, name: str | None) -> "RosBag":
-        """One of several robots, with its part of the options."""
         options, own = self._options, {slashed(topic.name) for topic in robot.topics}
         lasers = [k for k, topic in enumerate(options.scan_topics) if slashed(topic) in own]
         if options.scan_topics:
@@ -392,18 +384,11 @@ class RosBag:
         return RosBag(self.path, called, options, self._notes, robot)
 
     def _camera(self, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:
-        """The camera with its calibration and mounting; without them it is ignored, with a note."""
         path, topic = self.path, self.plan.topics.camera
         if topic is None:
             return None, ()
         camera, note = mounted_camera(self.plan.calibration, self.plan.tree, base_frame)
         return camera, (f"{path}: the camera of {topic.name} {note}",) * bool(note)
-
-
-def as_fleet(bags: Sequence[RosBag], options: BagOptions | None) -> list[RosBag]:
-    """The bags of one fleet with ``options``, read from the same topics if all of them have these."""
-    agreed, notes = agree_on_topics([candidates_of(bag.robot) for bag in bags], options or BagOptions())
-    return [RosBag(bag.path, bag.name, agreed, () if k else notes, bag.robot) for k, bag in enumerate(bags)]
 
 
 def _moved(mounted: Mounting, correction: BagCorrection) -> Mounting:

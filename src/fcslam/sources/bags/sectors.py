@@ -65,7 +65,6 @@ class SectorJoiner:
             self._sectors = []
 
     def _goes_on(self, sector: ScanMessage) -> bool:
-        """Whether a sector is a later one of the same turn."""
         first, last = self._sectors[0], self._sectors[-1]
         end = self._begin(last) + last.beams.beam_count
         begin = self._begin(sector)
@@ -86,7 +85,6 @@ class SectorJoiner:
         return round(forward_rad / first.beams.angle_increment_rad) % count
 
     def _joined(self) -> ScanMessage:
-        """One scan; directions of a sector that is missing are invalid."""
         first, last = self._sectors[0], self._sectors[-1]
         count, increment_rad = _turn_beams(first.beams), first.beams.angle_increment_rad
         ranges_m = np.full(count, nan, np.float32)
@@ -118,7 +116,6 @@ def joined_turns(sectors: Sequence[ScanMessage]) -> list[ScanMessage]:
 
 
 def _follows(a: ScanMessage, b: ScanMessage) -> bool:
-    """Whether ``b`` goes on where ``a`` ends, in either direction."""
     if not _is_alike(a, b):
         return False
     increment_rad, step_rad = a.beams.angle_increment_rad, b.beams.angle_min_rad - a.beams.angle_min_rad
@@ -134,7 +131,6 @@ def _is_alike(a: ScanMessage, b: ScanMessage) -> bool:
 
 
 def _is_clockwise(a: ScanMessage, b: ScanMessage) -> bool:
-    """Whether the beams, or without their times two successive sectors, are measured clockwise."""
     if a.sweep is not None:
         return a.sweep.last_s < a.sweep.first_s
     turned_rad = remainder(b.beams.angle_min_rad - a.beams.angle_min_rad, tau)

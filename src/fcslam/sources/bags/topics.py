@@ -1,9 +1,6 @@
 """Chooses the topics of a bag or of a live robot: those that the user names, or else by fixed rules, with a note."""
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from itertools import chain
 from typing import NamedTuple
 
 from fcslam.config import one_line
@@ -74,18 +71,6 @@ class Topics(NamedTuple):
     notes: tuple[str, ...]
 
 
-class Candidates(NamedTuple):
-    """The topics of one bag that can be read."""
-
-    scans: Sequence[Topic]
-    views_rad: Mapping[str, float]
-    """Field of view of each topic of scans, by name."""
-    measured: Sequence[Topic]
-    """Odometry."""
-    cameras: Sequence[Topic]
-    """Images with calibration."""
-
-
 def choose_topics(
     known: KnownTopics,
     options: BagOptions,
@@ -115,8 +100,7 @@ def choose_topics(
         raise SourceError(f"{known.label}{what}{known.place}; {remedy}; {_listed(known)}")
     lasers = [_named(known, name, "--sensors scan-topic") for name in options.scan_topics]
     if not lasers:
-        preferred = _preferred(scans)
-        lasers = [_best_scan(preferred, [_views_rad(preferred, field_of_view_rad)])]
+        lasers = [_best_scan(_preferred(scans), field_of_view_rad)]
     odometries = [*_measured(known), *known.transforms]
     if options.odom_topic == NO_ODOMETRY:
         odometries = []
@@ -126,46 +110,11 @@ def choose_topics(
     if not options.scan_topics:
         notes = [*_note(known, "laser scans", "--sensors scan-topic", lasers[0], scans), *notes]
     if measured := [topic for topic in odometries if topic.type == ODOMETRY]:
-        odometries = [_best_odometry(measured)]
+        odometries = [
+            min(measured, key=lambda topic: (last_part(topic.name) != "odom", -topic.message_count, topic.name))
+        ]
         notes += _note(known, "odometry", "--sensors odom-topic", odometries[0], measured)
     return Topics(tuple(lasers), tuple(odometries), known.transforms, camera, camera_info, tuple(notes))
-
-
-def find_candidates(
-    known: KnownTopics, field_of_view_rad: Callable[[Topic], float], has_images: Callable[[Topic], bool]
-) -> Candidates:
-    """The topics from which ``choose_topics`` would choose."""
-    scans, images = _preferred(_scans(known)), _images(known)
-    calibrated = [topic for topic in images if _calibration_of(topic, known) and has_images(topic)]
-    return Candidates(scans, _views_rad(scans, field_of_view_rad), _measured(known), calibrated)
-
-
-def agree_on_topics(bags: Sequence[Candidates], options: BagOptions) -> tuple[BagOptions, tuple[str, ...]]:
-    """Choose the same topics for all bags of a fleet, where ``options`` name none.
-
-    The rules are those of ``choose_topics``, applied to the topics that all bags have. If they share no topic of a
-    kind, each bag keeps its own choice.
-
-    Returns:
-        The options with the topics, and notes about the choice.
-    """
-    notes = []
-    scans = _common([bag.scans for bag in bags])
-    measured = _common([bag.measured for bag in bags])
-    cameras = _common([bag.cameras for bag in bags])
-    if scans and not options.scan_topics:
-        scan = _best_scan(scans, [bag.views_rad for bag in bags])
-        options = replace(options, scan_topics=(scan.name,))
-        notes += _fleet_note("laser scans", "--sensors scan-topic", scan, [bag.scans for bag in bags])
-    if measured and options.odom_topic is None:
-        odometry = _best_odometry(measured)
-        options = replace(options, odom_topic=odometry.name)
-        notes += _fleet_note("odometry", "--sensors odom-topic", odometry, [bag.measured for bag in bags])
-    if cameras and options.camera_topic is None:
-        camera = min(cameras, key=_camera_rank)
-        options = replace(options, camera_topic=camera.name)
-        notes += _fleet_note("images", "--sensors camera-topic", camera, [bag.cameras for bag in bags])
-    return options, tuple(notes)
 
 
 def _scans(known: KnownTopics) -> list[Topic]:
@@ -186,41 +135,19 @@ def _measured(known: KnownTopics) -> list[Topic]:
     return [topic for topic in known.heard if topic.type == ODOMETRY and not is_truth(topic.name)]
 
 
-def _common(candidates: Sequence[Sequence[Topic]]) -> list[Topic]:
-    names = set.intersection(*({topic.name for topic in own} for own in candidates))
-    counts = Counter[str]()
-    for topic in chain.from_iterable(candidates):
-        counts[topic.name] += topic.message_count
-    return [topic._replace(message_count=counts[topic.name]) for topic in candidates[0] if topic.name in names]
-
-
-def _views_rad(scans: Sequence[Topic], field_of_view_rad: Callable[[Topic], float]) -> dict[str, float]:
-    """Field of view of each topic by name; not looked up without a choice."""
-    return {topic.name: field_of_view_rad(topic) if len(scans) > 1 else 0.0 for topic in scans}
-
-
-def _best_scan(scans: Sequence[Topic], views_rad: Sequence[Mapping[str, float]]) -> Topic:
-    """``views_rad``: of each bag."""
-    view_rad = {topic: min(views[topic.name] for views in views_rad) for topic in scans}
+def _best_scan(scans: Sequence[Topic], field_of_view_rad: Callable[[Topic], float]) -> Topic:
+    if len(scans) == 1:
+        return scans[0]
+    view_rad = {topic: field_of_view_rad(topic) for topic in scans}
     wide = [topic for topic in scans if view_rad[topic] > max(view_rad.values()) - _SAME_VIEW_RAD]
     return min(
         wide, key=lambda topic: (topic.type != SCAN, last_part(topic.name) != "scan", -topic.message_count, topic.name)
     )
 
 
-def _best_odometry(measured: Sequence[Topic]) -> Topic:
-    return min(measured, key=lambda topic: (last_part(topic.name) != "odom", -topic.message_count, topic.name))
-
-
-def _fleet_note(what: str, option: str, chosen: Topic, candidates: Sequence[Sequence[Topic]]) -> list[str]:
-    others = ", ".join(sorted({topic.name for own in candidates for topic in own} - {chosen.name}))
-    return [f"all bags: reads {what} from {chosen.name}, not from {others} ({option} chooses)"] * bool(others)
-
-
 def _choose_camera(
     known: KnownTopics, wanted: str | None, has_images: Callable[[Topic], bool]
 ) -> tuple[Topic | None, Topic | None, list[str]]:
-    """Topics of images and of their calibration, and notes about the choice."""
     images = _images(known)
     if wanted is not None:
         images = [_named(known, wanted, "--sensors camera-topic")]
@@ -230,7 +157,10 @@ def _choose_camera(
         note = f"{known.label}no images of {names} can be read, the camera is left out"
         return None, None, [note] * bool(images)
     info_of = {camera: _calibration_of(camera, known) for camera in cameras}
-    chosen = min(cameras, key=lambda topic: (info_of[topic] is None, *_camera_rank(topic)))
+    chosen = min(
+        cameras,
+        key=lambda each: (info_of[each] is None, -each.message_count, each.type != COMPRESSED_IMAGE, each.name),
+    )
     if info_of[chosen] is None:
         note = f"{known.label}no calibration ({CAMERA_INFO}) of {chosen.name}, the camera is left out"
         return None, None, [note]
@@ -240,10 +170,6 @@ def _choose_camera(
 def _images(known: KnownTopics) -> list[Topic]:
     images = [topic for topic in known.heard if topic.type in (COMPRESSED_IMAGE, IMAGE)]
     return [topic for topic in images if not is_depth(topic.name)]
-
-
-def _camera_rank(topic: Topic) -> tuple[int, bool, str]:
-    return -topic.message_count, topic.type != COMPRESSED_IMAGE, topic.name
 
 
 def _calibration_of(camera: Topic, known: KnownTopics) -> Topic | None:
@@ -270,7 +196,6 @@ def is_depth(name: str) -> bool:
 
 
 def _named(known: KnownTopics, wanted: str, option: str) -> Topic:
-    """The topic that the user names by an option."""
     kinds, needed = _NEEDED[option]
     there = [topic for topic in (*known.own, *known.others) if slashed(topic.name) == slashed(wanted)]
     fitting = [topic for topic in there if topic.type in kinds and topic.message_count]

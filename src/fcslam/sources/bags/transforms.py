@@ -122,7 +122,6 @@ class TransformTree:
         return first
 
     def _along(self, base: str, frame: str) -> Transform:
-        """``T_base_frame`` of frames with one parent."""
         above_base, above_frame = list(self._above(base)), list(self._above(frame))
         meeting = next((ancestor for ancestor in above_frame if ancestor in above_base), None)
         if meeting is None:
@@ -183,7 +182,6 @@ class TransformTree:
             frame = next((parent for parent in parents if parent in self._parents), parents[0])
 
     def _chain(self, frames: list[str]) -> Transform:
-        """The transform from the last frame, through parents, to the first."""
         result = IDENTITY
         for child, parent in pairwise(frames):
             T_parent_child = self.links[parent, child]

@@ -82,7 +82,6 @@ def write_bag(path: Path, records: Iterable[SensorRecord]) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator["_Bag"]:
-    """A bag to write to, which moves to its place when it is complete."""
     from rosbags import rosbag1, rosbag2
 
     if path.suffix not in BAG_SUFFIXES:
@@ -104,8 +103,6 @@ def _opened(path: Path) -> Iterator["_Bag"]:
 
 
 class _Bag:
-    """Converts records to messages."""
-
     def __init__(self, writer: "Writer1 | Writer2", ros1: bool) -> None:
         self._writer: Any = writer
         self._codec = MessageCodec(ros1)
@@ -139,7 +136,6 @@ class _Bag:
             self._latest_reading = reading
 
     def _put_scan(self, stamp_ns: int, scan: LaserScan) -> None:
-        """Write a scan to the topic of its laser: lasers with different mountings are different ones."""
         T_base_laser = scan.laser.T_base_laser
         if T_base_laser not in self._mountings:
             self._mountings.append(T_base_laser)

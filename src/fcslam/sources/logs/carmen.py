@@ -149,7 +149,6 @@ def _parse_robotlaser(line: bytes) -> ScanLine:
 
 
 def _measured(front: bytes) -> tuple[int, bytes, StatedLaser]:
-    """Number of beams, ranges and laser in a line up to its remissions."""
     _, kind, start, fov, resolution, max_range, _, _, count, body = front.split(None, 9)
     beam_count = int(count)
     range_text = _without_remissions(body, beam_count)
@@ -210,5 +209,4 @@ def _check_beams(range_text: bytes, beam_count: int) -> None:
 
 
 def _has_beams(range_text: bytes, beam_count: int) -> bool:
-    """Whether a text has ``beam_count`` words, which most often are separated by single spaces."""
     return range_text.count(b" ") + 1 == beam_count or len(range_text.split()) == beam_count

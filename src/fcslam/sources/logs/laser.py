@@ -108,7 +108,6 @@ def _parameter_resolution_deg(beam_count: int, parameters: Mapping[str, str]) ->
 
 
 def _parameter(parameters: Mapping[str, str], name: str) -> float | None:
-    """A parameter's value; None if it is missing or not a finite number."""
     try:
         value = float(parameters[name])
     except (KeyError, ValueError):

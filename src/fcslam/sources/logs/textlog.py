@@ -61,8 +61,6 @@ SPINNING_HZ = 4.0, 20.0
 
 
 class _Reading(NamedTuple):
-    """Summary of a log, and how to read it."""
-
     survey: Survey
     pose_from_odometry: bool
     """Whether scans take the pose of the latest odometry message, because their own never changes."""
@@ -73,8 +71,6 @@ class _Reading(NamedTuple):
 
 
 class _Scan(NamedTuple):
-    """A scan that the gate admits."""
-
     line: ScanLine
     beams: Beams
     T_odom_base: Pose
@@ -134,7 +130,6 @@ class TextLog:
 
     @cached_property
     def _reading(self) -> _Reading:
-        """Summary from one pass over the whole log; rejects a log that cannot be mapped."""
         audit, sample, mounting = Audit(), RangeSample(), MountingEstimate()
         scans, odometry, parameters = PathSummary(), PathSummary(), dict[str, str]()
         declared = self._first_look()
@@ -200,7 +195,6 @@ class TextLog:
         return usual_log_beams(scans, parameters)
 
     def _kinds(self) -> str:
-        """The most common first words of the lines, with their numbers."""
         words = (text.split(None, 1)[:1] for _, text in numbered_lines(self._path))
         counts = Counter(word[0][:_LONGEST_WORD].decode("ascii", "replace") for word in words if word)
         return ", ".join(f"{count} {one_line(word)}" for word, count in counts.most_common(_WORDS_NAMED))
@@ -209,7 +203,6 @@ class TextLog:
         return self._kept or self._parsed()
 
     def _parsed(self) -> Iterator[NumberedLine]:
-        """Parse the log line by line; keeps the lines of a short log for the next pass."""
         parse = CarmenParser(is_raw(head(self._path)))
         kept, size, untimed = list[NumberedLine](), 0, 0
         for number, text in numbered_lines(self._path):
@@ -234,7 +227,6 @@ class TextLog:
     def _entries(
         self, scans: ScanRange, lines: Iterable[NumberedLine], audit: Audit
     ) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
-        """Scans and odometry of the range, with the poses to use; afterwards ``audit`` holds the range's faults."""
         for number, entry in scan_window(
             self._posed(lines, audit), scans, lambda entry: isinstance(entry, _Scan), audit
         ):
@@ -276,7 +268,6 @@ def _note_clock(number: int, line: ScanLine, audit: Audit) -> None:
 
 
 def _sound(lines: Iterable[NumberedLine], audit: Audit) -> Iterator[tuple[int, Line]]:
-    """The lines that are not broken; counts the others."""
     for number, line in lines:
         if line is None:
             audit.add(Fault.BROKEN_LINE, number)
