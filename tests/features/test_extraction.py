@@ -118,7 +118,7 @@ def test_two_images_of_one_name_are_told_apart(tmp_path, image, capsys):
 def test_images_beyond_any_cameras_size_are_not_decoded(tmp_path):
     header = b"\x89PNG\r\n\x1a\n" + b"\x00\x00\x00\rIHDR" + (1 << 20).to_bytes(4, "big") * 2
     (tmp_path / "huge.png").write_bytes(header + bytes(20))
-    with pytest.raises(FeatureError, match="at most 16384 pixels a side"):
+    with pytest.raises(FeatureError, match="cannot be read as an image"):
         read_grey(tmp_path / "huge.png")
 
 

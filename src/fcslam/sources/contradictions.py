@@ -3,50 +3,30 @@
 - A scan has the ranges of the scan before to the last bit, and the odometry moved, or the stamp is the same: a driver
   repeats it, or it was recorded twice. A robot skips it.
 - A scan has no return, as of a covered laser. It clears nothing (``fcslam.robot.mapped_scans``).
-- The odometry stands still and the scan changes: most beams measure another range than when it began to stand.
-- The odometry turned and still all beams measure what they did. Travel alone proves nothing: along a corridor, scans
-  stay the same.
-
-The last two are kept, as one sensor alone does not say which of both is wrong.
+- The odometry stands still and the scan changes: most beams measure another range than when it began to stand. The
+  scan is kept.
 """
 
-from dataclasses import dataclass
-from math import hypot, inf, isnan, remainder, tau
-from typing import NamedTuple
+from math import hypot, inf, remainder, tau
 
 import numpy as np
 
 from fcslam.records import LaserScan, Ranges
 from fcslam.sources.faults import Audit, Fault
-from fcslam.sources.pose import Pose, pose_of
+from fcslam.sources.pose import Pose
 
 STILL_M, STILL_RAD = 0.005, 0.003
 """Odometry that moved less stands still."""
-TURN_RAD = 0.35
-"""A turn that changes every scan, but in a round room."""
 CHANGE_M, CHANGE = 0.3, 0.05
 """A range that differs by more, in metres and as a share of it, measures something else."""
-CHANGED, UNCHANGED = 0.6, 0.02
-"""Share of the beams that measure something else, if the scan changed and if it did not."""
+CHANGED = 0.6
+"""Share of the beams that measure something else, if the scan changed."""
 FEWEST_RETURNS = 20
 """Scans with fewer common returns are not compared."""
 ALIKE = 0.3
 """Largest share of the beams that measure something else in two scans of one place."""
 FEWEST_ALTERNATING, ALTERNATING = 10, 0.1
 """Scans, and their share, between two that are alike and differ from it, of two lasers that publish on one topic."""
-
-
-class _Seen(NamedTuple):
-    scan: LaserScan
-    T_odom_base: Pose
-
-
-@dataclass(slots=True)
-class _Laser:
-    rest: _Seen
-    """The first scan where the odometry now stands."""
-    turn: _Seen
-    """The scan from which the turn is counted."""
 
 
 class RepeatedScans:
@@ -94,7 +74,8 @@ class ScanWatch:
     def __init__(self, audit: Audit) -> None:
         self._audit = audit
         self._repeated = RepeatedScans()
-        self._lasers: dict[Pose, _Laser] = {}
+        self._at_rest: dict[Pose, LaserScan] = {}
+        """The first scan of each laser where the odometry now stands."""
 
     def add(self, number: int, scan: LaserScan) -> None:
         """Count what is wrong with the next scan, which is on line (or in message) ``number``."""
@@ -103,24 +84,13 @@ class ScanWatch:
             return
         if not has_return(scan.ranges_m, scan.laser.max_range_m):
             self._audit.add(Fault.NO_RETURN, number)
-        x, y, theta = scan.T_odom_base.tolist()
-        if isnan(theta):
+        if np.isnan(scan.T_odom_base).any():
             return
-        seen = _Seen(scan, (x, y, theta))
-        known = self._lasers.get(scan.laser.T_base_laser)
-        if known is None:
-            self._lasers[scan.laser.T_base_laser] = _Laser(seen, seen)
-            return
-        if _is_still(known.rest.T_odom_base, seen.T_odom_base):
-            if _changed_share(known.rest.scan, scan) > CHANGED:
-                self._audit.add(Fault.FROZEN_ODOMETRY, number)
-        else:
-            known.rest = seen
-        moved_m, turned_rad = _motion(known.turn.T_odom_base, seen.T_odom_base)
-        if turned_rad > TURN_RAD and _changed_share(known.turn.scan, scan) < UNCHANGED:
-            self._audit.add(Fault.FROZEN_SCAN, number)
-        if turned_rad > TURN_RAD or moved_m > CHANGE_M:
-            known.turn = seen
+        rest = self._at_rest.get(scan.laser.T_base_laser)
+        if rest is None or not stands_still(rest, scan):
+            self._at_rest[scan.laser.T_base_laser] = scan
+        elif _changed_share(rest, scan) > CHANGED:
+            self._audit.add(Fault.FROZEN_ODOMETRY, number)
 
 
 def has_return(ranges_m: Ranges, max_range_m: float) -> bool:
@@ -145,17 +115,8 @@ def _repeats(before: LaserScan, after: LaserScan) -> bool:
 
 def stands_still(before: LaserScan, after: LaserScan) -> bool:
     """Whether the odometry stood still between two scans; false without odometry."""
-    return _is_still(pose_of(before.T_odom_base), pose_of(after.T_odom_base))
-
-
-def _is_still(before: Pose, after: Pose) -> bool:
-    moved_m, turned_rad = _motion(before, after)
-    return moved_m < STILL_M and turned_rad < STILL_RAD
-
-
-def _motion(before: Pose, after: Pose) -> tuple[float, float]:
-    (x0, y0, theta0), (x1, y1, theta1) = before, after
-    return hypot(x1 - x0, y1 - y0), abs(remainder(theta1 - theta0, tau))
+    (x0, y0, theta0), (x1, y1, theta1) = before.T_odom_base.tolist(), after.T_odom_base.tolist()
+    return hypot(x1 - x0, y1 - y0) < STILL_M and abs(remainder(theta1 - theta0, tau)) < STILL_RAD
 
 
 def _changed_share(before: LaserScan, after: LaserScan) -> float:

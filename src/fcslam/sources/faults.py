@@ -16,7 +16,6 @@ class Fault(StrEnum):
     NO_ODOMETRY = "scans without odometry within 1 s skipped"
     HELD_ODOMETRY = "scans beyond the odometry's ends given its nearest pose"
     FROZEN_ODOMETRY = "scans that change while the odometry stands still kept"
-    FROZEN_SCAN = "scans that stay the same while the odometry turns kept"
     REPEATED_SCAN = "scans that repeat the scan before skipped"
     ODOMETRY_JUMP = "jumps of the odometry bridged by scan matching"
     ODOMETRY_GAP = "scans in gaps of the odometry of more than 1 s kept"
