@@ -14,8 +14,6 @@ from fcslam.untrusted import MOST_TEXT_BYTES, read_text
 
 LONGEST_QUOTE: Final = 300
 """Longer texts from a file are cut in messages."""
-_LONGEST_NUMBER: Final = 100
-"""Characters of a number in YAML. Python converts long integers slowly, and back to text not at all."""
 
 
 class StrictModel(BaseModel):
@@ -63,11 +61,7 @@ def changed(settings: SettingsType, content: dict[str, Any], where: str) -> Sett
 
 
 def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> SettingsType:
-    """Check ``content`` against ``kind``; ``where`` names its origin in messages.
-
-    Raises:
-        InputError: a key is unknown (the message names the most similar key), or a value is wrong.
-    """
+    """Check ``content`` against ``kind``; ``where`` names its origin in messages."""
     try:
         return kind.model_validate(content)
     except ValidationError as error:
@@ -87,7 +81,6 @@ def _refusal(kind: type[Settings], error: ValidationError, where: str) -> InputE
 
 
 def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """``base`` with the keys of ``changes``; nested mappings are merged key by key."""
     merged = dict(base)
     for key, value in changes.items():
         nested = isinstance(value, dict) and isinstance(base.get(key), dict)
@@ -116,7 +109,6 @@ def _lines(settings: Settings, indent: int) -> list[str]:
 
 
 def _flow(value: Any) -> str:
-    """YAML of one value on one line."""
     text: str = yaml.safe_dump(value, default_flow_style=True, width=math.inf)
     return text.removesuffix("\n...\n").strip()
 
@@ -131,34 +123,31 @@ def _nearest(kind: type[Settings], loc: tuple[int | str, ...]) -> str:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Refuses aliases and merge keys, with which a short text expands without end, and a mapping with a key twice.
-
-    YAML forbids the latter, and the second value would win without a word.
-    """
+    """Refuses what expands a short text without end, and a mapping with a key twice, of which the last would count."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """As of a SafeLoader."""
         if self.check_event(yaml.AliasEvent):
-            raise yaml.constructor.ConstructorError(None, None, "aliases are not read", self.peek_event().start_mark)  # type: ignore[no-untyped-call]
+            raise _refused("aliases are not read", self.peek_event())  # type: ignore[no-untyped-call]
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """As of a SafeLoader."""
-        keys = [(key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        twice = next((key for key, count in Counter(keys).items() if count > 1), None)
-        if any(tag == "tag:yaml.org,2002:merge" for tag, _ in keys):
-            raise yaml.constructor.ConstructorError(None, None, "merge keys (<<) are not read", node.start_mark)
-        if twice is not None:
-            raise yaml.constructor.ConstructorError(None, None, f"the key '{twice[1]}' occurs twice", node.start_mark)
+        keys = Counter((key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        for (tag, key), count in keys.items():
+            if tag == "tag:yaml.org,2002:merge":
+                raise _refused("merge keys (<<) are not read", node)
+            if count > 1:
+                raise _refused(f"the key '{key}' occurs twice", node)
         return super().construct_mapping(node, deep)
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """As of a SafeLoader."""
-        if node.tag.endswith((":int", ":float")) and len(node.value) > _LONGEST_NUMBER:
-            raise yaml.constructor.ConstructorError(
-                None, None, f"a number of {len(node.value)} characters; the limit is {_LONGEST_NUMBER}", node.start_mark
-            )
+        # Python converts long integers slowly, and back to text not at all
+        if node.tag.endswith((":int", ":float")) and len(node.value) > 100:
+            raise _refused(f"a number of {len(node.value)} characters; the limit is 100", node)
         return super().construct_object(node, deep)
+
+
+def _refused(reason: str, where: Any) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=reason, problem_mark=where.start_mark)
 
 
 def parse_yaml(text: str | bytes, most: int = MOST_TEXT_BYTES) -> Any:

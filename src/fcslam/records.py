@@ -4,6 +4,7 @@ Poses are (x, y, theta) in metres and radians; ``T_a_b`` takes coordinates in b 
 REP 105: ``map``, ``odom``, ``base``, ``laser``. Stamps are seconds of the recording's own clock.
 """
 
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -48,11 +49,7 @@ def frozen(array: ArrayLike, dtype: type[Scalar] = np.float64) -> NDArray[Scalar
 
 
 def checked_pose(name: str, given: ArrayLike) -> FloatArray:
-    """A pose, shape (3,); ``name`` is what messages call it.
-
-    Raises:
-        InputError: it has another shape, or a number is not finite.
-    """
+    """A finite pose of a user, shape (3,); ``name`` is what messages call it."""
     try:
         pose: FloatArray = frozen(given)
     except (TypeError, ValueError) as error:
@@ -73,7 +70,7 @@ class Beams(NamedTuple):
 
     @property
     def span_rad(self) -> float:
-        """Angle from the first to the last beam."""
+        """From the first to the last beam."""
         return (self.beam_count - 1) * self.angle_increment_rad
 
 
@@ -136,7 +133,7 @@ class Sweep(NamedTuple):
 
     @property
     def mean_velocity(self) -> tuple[float, float, float]:
-        """Over as long as the sweep lasts, from the stamp on; x and y in m/s, heading in rad/s."""
+        """Over a sweep's duration from the stamp on; x and y in m/s, heading in rad/s."""
         half_s, (vx, vy, vtheta), (ax, ay, atheta) = 0.5 * self.duration_s, self.velocity, self.acceleration
         return vx + half_s * ax, vy + half_s * ay, vtheta + half_s * atheta
 
@@ -318,30 +315,12 @@ PLACE_CHANNELS = (Channel.LIDAR, Channel.CAMERA)
 """Sensors of the descriptors of places."""
 
 
-class TagFamily(StrEnum):
-    """Families of square tags, by the names of OpenCV's dictionaries without ``DICT_``."""
-
-    APRILTAG_16H5 = "apriltag_16h5"
-    APRILTAG_25H9 = "apriltag_25h9"
-    APRILTAG_36H10 = "apriltag_36h10"
-    APRILTAG_36H11 = "apriltag_36h11"
-    ARUCO_ORIGINAL = "aruco_original"
-    ARUCO_4X4_50 = "4x4_50"
-    ARUCO_4X4_100 = "4x4_100"
-    ARUCO_4X4_250 = "4x4_250"
-    ARUCO_4X4_1000 = "4x4_1000"
-    ARUCO_5X5_50 = "5x5_50"
-    ARUCO_5X5_100 = "5x5_100"
-    ARUCO_5X5_250 = "5x5_250"
-    ARUCO_5X5_1000 = "5x5_1000"
-    ARUCO_6X6_50 = "6x6_50"
-    ARUCO_6X6_100 = "6x6_100"
-    ARUCO_6X6_250 = "6x6_250"
-    ARUCO_6X6_1000 = "6x6_1000"
-    ARUCO_7X7_50 = "7x7_50"
-    ARUCO_7X7_100 = "7x7_100"
-    ARUCO_7X7_250 = "7x7_250"
-    ARUCO_7X7_1000 = "7x7_1000"
+TagFamily = StrEnum(
+    "TagFamily",
+    "APRILTAG_16H5 APRILTAG_25H9 APRILTAG_36H10 APRILTAG_36H11 ARUCO_ORIGINAL 4X4_50 4X4_100 4X4_250 4X4_1000 5X5_50 "
+    "5X5_100 5X5_250 5X5_1000 6X6_50 6X6_100 6X6_250 6X6_1000 7X7_50 7X7_100 7X7_250 7X7_1000",
+)
+"""Families of square tags, by the names of OpenCV's dictionaries without ``DICT_``."""
 
 
 class Tag(NamedTuple):
@@ -427,72 +406,46 @@ class ClosureStatus(StrEnum):
 
 
 class ReasonCode(StrEnum):
-    """Why a closure has its status; the text of ``Reason`` explains each."""
+    """Why a closure has its status."""
 
-    FOUND_BY_ROBOT = "found_by_robot"
-    VERIFIED = "verified"
-    FITS_JOINT_MAP = "fits_joint_map"
-    IN_CLUSTER = "in_dominant_cluster"
-    FITS_JOINT_GRAPH = "fits_joint_graph"
-    SAME_TAG = "same_tag"
-    SIMILAR = "similar"
-    MATCHED_POINT = "matched_point"
-    NOT_ENOUGH_EXPLAINED = "not_enough_explained"
-    IN_FREE_SPACE = "in_free_space"
-    FEW_POINTS = "few_points"
-    LITTLE_OVERLAP = "little_overlap"
-    ASYMMETRIC = "asymmetric_alignment"
-    ONE_DIRECTION = "fixed_in_one_direction"
-    NOT_INFORMATIVE = "no_informative_closure"
-    FEW_CLOSURES = "few_consistent_closures"
-    FEW_PLACES = "few_separate_places"
-    NOT_UNIQUE = "alignment_not_unique"
-    MAPS_CONTRADICT = "maps_contradict"
-    WALLS_DIFFER = "walls_differ"
-    LOOK_ALIKE = "fits_elsewhere"
-    NO_LEAD = "no_clear_lead"
-    RIVAL_PLACES = "rival_has_more_places"
-    OUTSIDE_CLUSTER = "outside_dominant_cluster"
-    CONTRADICTS_JOINT_GRAPH = "contradicts_joint_graph"
-    FALSE_BRIDGE = "joins_contradicting_maps"
-    VETOED = "vetoed"
-    PINNED = "pinned"
-    MADE_BY_HAND = "made_by_hand"
-    UNUSED = "not_needed_by_rigid_fusion"
+    text: str
+    """The explanation, with the measured value and its limit."""
 
+    def __new__(cls, code: str, text: str = "") -> Self:
+        """A code with its explanation."""
+        member = str.__new__(cls, code)
+        member._value_, member.text = code, text
+        return member
 
-_REASON_TEXT = {
-    ReasonCode.FOUND_BY_ROBOT: "found by the robot",
-    ReasonCode.VERIFIED: "passes the geometric verification",
-    ReasonCode.FITS_JOINT_MAP: "fits the joint map: {value} m off, less than {limit}",
-    ReasonCode.IN_CLUSTER: "in the dominant cluster of {value} closures",
-    ReasonCode.FITS_JOINT_GRAPH: "fits the joint graph",
-    ReasonCode.SAME_TAG: "both saw the same tag, number {value}",
-    ReasonCode.SIMILAR: "the similarity of the words is {value}, {limit} needed",
-    ReasonCode.MATCHED_POINT: "one of {value} matched points of the rigid fusion",
-    ReasonCode.NOT_ENOUGH_EXPLAINED: "a share of {value} of the points lies on a surface, {limit} needed",
-    ReasonCode.IN_FREE_SPACE: "a share of {value} of the points lies in free space, {limit} allowed",
-    ReasonCode.FEW_POINTS: "{value} points lie on a surface, {limit} needed",
-    ReasonCode.LITTLE_OVERLAP: "a share of {value} of the points lies in known area, {limit} needed",
-    ReasonCode.ASYMMETRIC: "the alignments of both directions differ by {value}, less than {limit} needed",
-    ReasonCode.ONE_DIRECTION: "fixed in one direction only, as in a corridor: eigenvalue {value}, {limit} needed",
-    ReasonCode.NOT_INFORMATIVE: "none of the {value} consistent closures fixes the position in every direction",
-    ReasonCode.FEW_CLOSURES: "{value} of them agree, {limit} needed",
-    ReasonCode.FEW_PLACES: "they agree from {value} separate places, {limit} needed",
-    ReasonCode.NOT_UNIQUE: "the alignment is not unique: its score is {value} times the best elsewhere, {limit} needed",
-    ReasonCode.MAPS_CONTRADICT: "a share of {value} of the aligned maps' surfaces lies in free space, {limit} allowed",
-    ReasonCode.WALLS_DIFFER: "their walls lie farther apart than those of one place: likeness {value}, {limit} needed",
-    ReasonCode.LOOK_ALIKE: "the maps fit only {value} times as well as elsewhere, {limit} times needed",
-    ReasonCode.NO_LEAD: "{value} times as many closures agree as contradict them, {limit} times needed",
-    ReasonCode.RIVAL_PLACES: "closures from {value} separate places agree, but others from {limit} contradict them",
-    ReasonCode.OUTSIDE_CLUSTER: "outside the dominant cluster",
-    ReasonCode.CONTRADICTS_JOINT_GRAPH: "contradicts the joint graph",
-    ReasonCode.FALSE_BRIDGE: "one robot alone joins maps of which {value} pairs contradict each other",
-    ReasonCode.VETOED: "vetoed by hand",
-    ReasonCode.PINNED: "pinned by hand",
-    ReasonCode.MADE_BY_HAND: "made by hand",
-    ReasonCode.UNUSED: "not needed by the rigid fusion",
-}
+    FOUND_BY_ROBOT = "found_by_robot", "found by the robot"
+    VERIFIED = "verified", "passes the geometric verification"
+    FITS_JOINT_MAP = "fits_joint_map", "fits the joint map: {value} m off, less than {limit}"
+    IN_CLUSTER = "in_dominant_cluster", "in the dominant cluster of {value} closures"
+    FITS_JOINT_GRAPH = "fits_joint_graph", "fits the joint graph"
+    SAME_TAG = "same_tag", "both saw the same tag, number {value}"
+    SIMILAR = "similar", "the similarity of the words is {value}, {limit} needed"
+    MATCHED_POINT = "matched_point", "one of {value} matched points of the rigid fusion"
+    NOT_ENOUGH_EXPLAINED = "not_enough_explained", "a share of {value} of the points lies on a surface, {limit} needed"
+    IN_FREE_SPACE = "in_free_space", "a share of {value} of the points lies in free space, {limit} allowed"
+    FEW_POINTS = "few_points", "{value} points lie on a surface, {limit} needed"
+    LITTLE_OVERLAP = "little_overlap", "a share of {value} of the points lies in known area, {limit} needed"
+    ASYMMETRIC = "asymmetric_alignment", "the alignments of both directions differ by {value}, less than {limit} needed"
+    ONE_DIRECTION = "fixed_in_one_direction", "fixed in one direction only: eigenvalue {value}, {limit} needed"
+    NOT_INFORMATIVE = "no_informative_closure", "none of the {value} closures fixes the position in every direction"
+    FEW_CLOSURES = "few_consistent_closures", "{value} of them agree, {limit} needed"
+    FEW_PLACES = "few_separate_places", "they agree from {value} separate places, {limit} needed"
+    NOT_UNIQUE = "alignment_not_unique", "not unique: the score is {value} times the best elsewhere, {limit} needed"
+    MAPS_CONTRADICT = "maps_contradict", "a share of {value} of the surfaces lies in free space, {limit} allowed"
+    WALLS_DIFFER = "walls_differ", "walls lie farther apart than those of one place: likeness {value}, {limit} needed"
+    LOOK_ALIKE = "fits_elsewhere", "the maps fit only {value} times as well as elsewhere, {limit} times needed"
+    NO_LEAD = "no_clear_lead", "{value} times as many closures agree as contradict them, {limit} times needed"
+    RIVAL_PLACES = "rival_has_more_places", "{value} separate places agree, but {limit} contradict them"
+    CONTRADICTS_JOINT_GRAPH = "contradicts_joint_graph", "contradicts the joint graph"
+    FALSE_BRIDGE = "joins_contradicting_maps", "one robot alone joins maps of which {value} pairs contradict each other"
+    VETOED = "vetoed", "vetoed by hand"
+    PINNED = "pinned", "pinned by hand"
+    MADE_BY_HAND = "made_by_hand", "made by hand"
+    UNUSED = "not_needed_by_rigid_fusion", "not needed by the rigid fusion"
 
 
 @dataclass(frozen=True, slots=True)
@@ -511,7 +464,7 @@ class Reason:
 
     def __str__(self) -> str:
         """One clause, with the setting in brackets."""
-        text = _REASON_TEXT[self.code].format(value=_short(self.value), limit=_short(self.limit))
+        text = self.code.text.format(value=_short(self.value), limit=_short(self.limit))
         return f"{text} ({self.setting})" if self.setting else text
 
 
@@ -551,7 +504,8 @@ class Veto:
         """Whether the veto forbids this closure, in either order of its ends."""
         ends = ((robot_i, stamp_i), (robot_j, stamp_j))
         return any(
-            (self.robot_i, self.robot_j) == (i, j) and (self.stamps is None or _same_stamps(self.stamps, (at_i, at_j)))
+            (self.robot_i, self.robot_j) == (i, j)
+            and (self.stamps is None or math.dist(self.stamps, (at_i, at_j)) <= SAME_STAMP_S)
             for (i, at_i), (j, at_j) in (ends, ends[::-1])
         )
 
@@ -563,10 +517,6 @@ class Removal:
     robot: str
     epoch: int | None = None
     """Epoch of the session; None: all sessions of the robot, later ones as well."""
-
-    def covers(self, robot: str, epoch: int) -> bool:
-        """Whether it removes this session."""
-        return self.robot == robot and self.epoch in (None, epoch)
 
 
 @dataclass(frozen=True, slots=True)
@@ -580,10 +530,6 @@ class Cut:
     first_s: float
     """Stamp at which the stretch begins."""
     last_s: float
-
-    def covers(self, session: str, stamp: float) -> bool:
-        """Whether the stretch holds the session's keyscan with this stamp."""
-        return self.session == session and self.first_s <= stamp <= self.last_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -680,10 +626,6 @@ class Edit:
     time_s: float
     """Seconds since 1970."""
     content: Change | Undo
-
-
-def _same_stamps(a: tuple[float, float], b: tuple[float, float]) -> bool:
-    return abs(a[0] - b[0]) <= SAME_STAMP_S and abs(a[1] - b[1]) <= SAME_STAMP_S
 
 
 @dataclass(frozen=True, slots=True)

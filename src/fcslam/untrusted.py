@@ -29,29 +29,17 @@ MOST_TEXT_BYTES: Final = 1 << 18
 """Largest file of settings, or description of a map."""
 FREE_BYTES: Final = 1 << 25
 """Compressed content may always expand to this size."""
-MOST_RATIO: Final = 32
-"""Above it, content that is kept in memory may expand by this factor."""
-MOST_IMAGE_RATIO: Final = 64
-"""The same for the pixels of an image; a map of unknown cells compresses well."""
-MOST_STREAM_RATIO: Final = 100
-"""The same for content that is read piece by piece. Logs of lasers that see little compress well."""
+MOST_RATIO: Final = 64
+"""Above it, content that is kept in memory may expand by this factor; a map of unknown cells compresses well."""
+MOST_STREAM_RATIO: Final = 200
+"""The same for content that is read piece by piece. Scans of a simulated robot that stands compress well."""
 MOST_LINES: Final = 5_000_000
 """Lines of a compressed text, beside one for each of its bytes; a line of a log has tens of bytes."""
-MOST_CHUNKS_RATIO: Final = 200
-"""The same for all chunks of a bag together; each is small. Scans of a simulated robot that stands compress well."""
 _MOST_FRAMES: Final = 100
 """Compressed frames in one content."""
 STEPS: Final = 100_000
 """Steps of SQLite between two looks at their number."""
-_FREE_STEPS: Final = 20_000_000
-_STEPS_PER_BYTE: Final = 20
-"""Steps that SQLite may take to read a database; an honest one needs less than one per byte."""
 _BUFFER_BYTES: Final = 1 << 17
-_COMPRESSED: Final = (".gz", ".xz", ".bz2")
-_PNG: Final = b"\x89PNG\r\n\x1a\n"
-_IMAGES: Final = ("JPEG", "PPM", "TIFF", "BMP", "WEBP")
-_BYTES_OF_BAND: Final = {"I": 4, "F": 4, "I;16": 2, "I;16B": 2}
-"""Bytes of a pixel by Pillow's mode; the other modes have one for each band."""
 _FLAGS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 """Without O_NONBLOCK, opening a pipe waits for a writer."""
 
@@ -71,8 +59,7 @@ def open_file(path: Path, within: Path | None = None, most: int | None = None) -
         most: the largest size, bytes; None: any.
 
     Raises:
-        OSError: the file is missing, unreadable, a link within the folder, or a folder, pipe or device.
-        LimitError: it is larger than ``most``.
+        OSError: the file cannot be opened, is no regular file, or is a link within the folder; too large: LimitError.
     """
     descriptor = os.open(path, _FLAGS) if within is None else _open_within(path, within)
     try:
@@ -89,32 +76,14 @@ def open_file(path: Path, within: Path | None = None, most: int | None = None) -
         raise
 
 
-def check_file(path: Path, within: Path) -> None:
-    """Refuse what ``open_file`` does not open.
-
-    Raises:
-        OSError: as ``open_file``.
-    """
-    open_file(path, within).close()
-
-
 def read_bytes(path: Path, within: Path | None = None, most: int = MOST_BYTES) -> bytes:
-    """The content of a file.
-
-    Raises:
-        OSError: as ``open_file``, or the file is larger than ``most``.
-    """
+    """The content of a file; raises as ``open_file``."""
     with open_file(path, within, most) as file:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
 def read_text(path: Path, within: Path | None = None, most: int = MOST_BYTES) -> str:
-    """The content of a file of UTF-8 text, its line ends as they are.
-
-    Raises:
-        OSError: as ``read_bytes``.
-        ValueError: it is not UTF-8.
-    """
+    """The content of a file of UTF-8 text, its line ends as they are; what is not UTF-8 is a ValueError."""
     return read_bytes(path, within, most).decode("utf-8")
 
 
@@ -122,7 +91,7 @@ def read_arrays(path: Path) -> Arrays:
     """Every array of a ``.npz`` file; objects are not read.
 
     Raises:
-        OSError: as ``open_file``, or the arrays are larger than ``most_unpacked`` of the file's size.
+        OSError: as ``open_file``, or the arrays expand beyond the limit.
         ValueError: the file is not an archive of arrays, or is broken.
     """
     with open_file(path) as file:
@@ -133,30 +102,16 @@ def read_arrays(path: Path) -> Arrays:
             file.seek(0)
             with np.load(file, allow_pickle=False) as found:
                 return {name: found[name] for name in found.files}
-        except (
-            zipfile.BadZipFile,
-            EOFError,
-            KeyError,
-            AttributeError,
-            RuntimeError,
-            TypeError,
-            zlib.error,
-            lzma.LZMAError,
-            MemoryError,
-        ) as error:
+        except OSError:
+            raise
+        except Exception as error:  # the archive, its compressions and NumPy have errors of their own
             raise ValueError(f"no archive of arrays: {error}") from error
 
 
 def open_unpacked(path: Path, by_name: bool = False) -> BinaryIO:
     """Open a file that may be compressed by gzip, xz or bzip2, as its first bytes say, to read what it holds.
 
-    Args:
-        path: of the file.
-        by_name: whether a file named as a compressed one must be compressed.
-
-    Raises:
-        OSError: as ``open_file``, or the name says otherwise. Reading raises ``LimitError`` if the file expands beyond
-            the limit.
+    ``by_name``: a file that is named as a compressed one must be one. Reading raises ``LimitError`` beyond the limit.
     """
     file = open_file(path)
     magic = file.read(6)
@@ -168,7 +123,7 @@ def open_unpacked(path: Path, by_name: bool = False) -> BinaryIO:
         unpacking = lzma.LZMAFile(file)  # noqa: SIM115  _Limited closes it
     elif magic.startswith(b"BZh"):
         unpacking = bz2.BZ2File(file)
-    elif by_name and path.suffix in _COMPRESSED:
+    elif by_name and path.suffix in (".gz", ".xz", ".bz2"):
         file.close()
         raise OSError(f"not a {path.suffix} file")
     else:
@@ -216,11 +171,7 @@ def most_unpacked(packed: int, ratio: int = MOST_RATIO) -> int:
 
 
 def check_unpacked(packed: int, unpacked: int, ratio: int = MOST_RATIO) -> None:
-    """Check what ``packed`` bytes from outside expand to.
-
-    Raises:
-        LimitError: to more than ``most_unpacked``.
-    """
+    """Raise ``LimitError`` if ``packed`` bytes from outside expand beyond the limit."""
     most = most_unpacked(packed, ratio)
     if unpacked > most:
         raise LimitError(f"{_size(packed)} unpack to more than {_size(most)}, the limit")
@@ -242,8 +193,18 @@ def unpack(packed: bytes, compression: str, most: int | None = None) -> bytes:
         return packed
     allowed = most_unpacked(len(packed))
     limit = allowed + 1 if most is None else min(most, allowed + 1)
+    content, left, is_whole = b"", packed, True
     try:
-        content, is_whole = _unpacked(packed, _DECOMPRESSORS[compression], limit)
+        for _ in range(_MOST_FRAMES):
+            if len(content) == limit:  # zlib takes 0 for no limit
+                break
+            unpacking = _decompressor(compression)
+            part = unpacking.decompress(left, limit - len(content))
+            content, left, is_whole = content + part if content else part, unpacking.unused_data, unpacking.eof
+            if not is_whole or not left:
+                break
+        else:
+            raise ValueError(f"more than {_MOST_FRAMES} frames")
     except Exception as error:  # four libraries, each with errors of its own
         raise ValueError(f"damaged {compression} data ({error})") from error
     check_unpacked(len(packed), len(content))
@@ -252,15 +213,25 @@ def unpack(packed: bytes, compression: str, most: int | None = None) -> bytes:
     return content
 
 
-def check_image(encoded: bytes) -> None:
-    """Check the size of an image by its header, before its pixels are decoded.
+def _decompressor(compression: str) -> Any:
+    if compression == "lz4":
+        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 
-    Raises:
-        LimitError: the pixels would fill the memory.
-        ValueError: it is no image of a known format.
-    """
-    width, height, pixel_bytes = _png_size(encoded) if encoded.startswith(_PNG) else _image_size(encoded)
-    most = most_unpacked(len(encoded), MOST_IMAGE_RATIO)
+        return LZ4FrameDecompressor()
+    if compression == "zstd":
+        from backports.zstd import ZstdDecompressor
+
+        return ZstdDecompressor()
+    plain: dict[str, Callable[[], Any]] = {"zlib": zlib.decompressobj, "bz2": bz2.BZ2Decompressor}
+    return plain[compression]()
+
+
+def check_image(encoded: bytes) -> None:
+    """Check the size of an image by its header, before its pixels are decoded; an unknown format is a ValueError."""
+    width, height, pixel_bytes = (
+        _png_size(encoded) if encoded.startswith(b"\x89PNG\r\n\x1a\n") else _image_size(encoded)
+    )
+    most = most_unpacked(len(encoded))
     if width * height * pixel_bytes > most:
         raise LimitError(
             f"the image has {width} x {height} pixels, which would fill the memory; the limit is {_size(most)}"
@@ -278,47 +249,15 @@ def _image_size(encoded: bytes) -> tuple[int, int, int]:
     from PIL import Image
 
     try:
-        with warnings.catch_warnings(), Image.open(io.BytesIO(encoded), formats=_IMAGES) as image:
-            return (*image.size, _BYTES_OF_BAND.get(image.mode, len(image.getbands())))
+        with (
+            warnings.catch_warnings(),
+            Image.open(io.BytesIO(encoded), formats=("JPEG", "PPM", "TIFF", "BMP", "WEBP")) as image,
+        ):
+            return (*image.size, 4 if image.mode[0] in "IF" else len(image.getbands()))
     except Image.DecompressionBombError as error:
         raise LimitError(str(error)) from error
     except Exception as error:  # Pillow's formats raise errors of many types
         raise ValueError("the image cannot be read; copy it again, or save it as PGM or PNG") from error
-
-
-def _unpacked(packed: bytes, decompressor: Callable[[], Any], limit: int) -> tuple[bytes, bool]:
-    """The content up to ``limit`` bytes, and whether its last frame is whole."""
-    content = b""
-    for _ in range(_MOST_FRAMES):
-        if len(content) == limit:  # zlib takes 0 for no limit
-            return content, True
-        unpacking = decompressor()
-        part = unpacking.decompress(packed, limit - len(content))
-        content = content + part if content else part
-        packed = unpacking.unused_data
-        if not unpacking.eof or not packed:
-            return content, unpacking.eof
-    raise ValueError(f"more than {_MOST_FRAMES} frames")
-
-
-def _lz4() -> Any:
-    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
-
-    return LZ4FrameDecompressor()
-
-
-def _zstd() -> Any:
-    from backports.zstd import ZstdDecompressor
-
-    return ZstdDecompressor()
-
-
-_DECOMPRESSORS: Final[dict[str, Callable[[], Any]]] = {
-    "zlib": zlib.decompressobj,
-    "bz2": bz2.BZ2Decompressor,
-    "lz4": _lz4,
-    "zstd": _zstd,
-}
 
 
 def open_database(path: Path) -> sqlite3.Connection:
@@ -355,7 +294,7 @@ def longest_value(size: int) -> int:
 
 def step_counter(size: int) -> Callable[[], bool]:
     """A progress handler for a database of ``size`` bytes, called every ``STEPS``: true when it takes too many."""
-    left = (_FREE_STEPS + _STEPS_PER_BYTE * size) // STEPS
+    left = (20_000_000 + 20 * size) // STEPS  # an honest database needs less than one step per byte
 
     def is_too_much() -> bool:
         nonlocal left

@@ -170,5 +170,5 @@ def test_a_bad_file_of_tags_gets_one_line(tmp_path, text, reason):
 def test_a_file_of_tags_is_read(tmp_path):
     path = tmp_path / "tags.yaml"
     path.write_text("family: 4x4_50\ntags:\n  7: {x: 1, y: -2.5}\n  8: {x: 0, y: 0, yaw: 1.57}\n")
-    family = TagFamily.ARUCO_4X4_50
+    family = TagFamily("4x4_50")
     assert read_survey(path) == {Tag(family, 7): (1.0, -2.5, None), Tag(family, 8): (0.0, 0.0, 1.57)}

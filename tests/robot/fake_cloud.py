@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import DetectorFile
-from fcslam.wire.http_transport import CloudState, HttpResponse, Refusal
+from fcslam.wire.http_transport import CloudState, HttpResponse
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate
 from fcslam.wire.packets import decode, encode, readdress
 from tests.wire.examples import CLOSURE, CORRECTION, HELLO, packet
@@ -62,7 +62,7 @@ class FakeCloud:
             key = sent.epoch, sent.sequence
             if content(data) in self.unwanted:
                 self.refused[key] = "unwanted"
-                return HttpResponse(refusal=Refusal(index, "unwanted"))
+                return HttpResponse(refusal=(index, "unwanted"))
             assert self.stored.setdefault(key, data) == data, "two packets of one number"
         epoch = decode(packets[0]).epoch if packets else max((e for e, _ in self.stored), default=0)
         answer = []

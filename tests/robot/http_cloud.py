@@ -31,7 +31,7 @@ class HttpCloud:
             return 200, {}, json.dumps({"next": state.expected, "refused": refused}).encode()
         answer = self.cloud.send(read_batch(body), int(headers.get(CORRECTION_HEADER, -1)))
         if answer.refusal is not None:
-            detail = {"error": answer.refusal.reason, "index": answer.refusal.index}
+            detail = {"error": answer.refusal[1], "index": answer.refusal[0]}
             return 400, {}, json.dumps(detail).encode()
         headers = {"Content-Type": MEDIA_TYPE, REFUSED_HEADER: str(answer.refused)}
         return 200, headers, write_batch(answer.packets)

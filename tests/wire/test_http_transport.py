@@ -9,7 +9,7 @@ from fcslam.errors import CloudError, OversizeError, UnavailableError
 from fcslam.records import Channel
 from fcslam.service.credentials import make_credentials
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch
-from fcslam.wire.http_transport import HttpResponse, HttpTransport, InstancesTransport, Refusal, addresses
+from fcslam.wire.http_transport import HttpResponse, HttpTransport
 from fcslam.wire.keys import Credentials
 from fcslam.wire.messages import Acknowledgement
 from fcslam.wire.packets import decode, encode
@@ -73,7 +73,7 @@ def test_asking_for_what_is_new_sends_no_bytes(cloud, transport):
 
 def test_a_refused_packet_is_told_by_its_place(cloud, transport):
     cloud.canned.append(error(400, "bad", index=1))
-    assert transport.send(PACKETS, -1) == HttpResponse(refusal=Refusal(1, f"{cloud.url}: bad (400)"))
+    assert transport.send(PACKETS, -1) == HttpResponse(refusal=(1, f"{cloud.url}: bad (400)"))
 
 
 def test_a_token_that_is_not_known_names_the_option(cloud, transport):
@@ -139,8 +139,7 @@ def test_nobody_there_is_no_reason_to_give_up():
 
 
 def test_where_an_instance_does_not_answer_the_next_one_is_asked_and_stays(cloud):
-    nobody, somebody = (HttpTransport(url, "r", "ab" * 16) for url in addresses(f"http://127.0.0.1:9, {cloud.url}"))
-    instances = InstancesTransport([nobody, somebody])
+    instances = HttpTransport(f"http://127.0.0.1:9, {cloud.url}", "r", "ab" * 16)
     with pytest.raises(UnavailableError, match=r"127\.0\.0\.1:9"):
         instances.state()  # the caller waits before it tries again
     instances.send(PACKETS, -1)
@@ -151,8 +150,7 @@ def test_where_an_instance_does_not_answer_the_next_one_is_asked_and_stays(cloud
     with pytest.raises(UnavailableError, match=r"127\.0\.0\.1:9"):
         instances.state()
     assert instances.state().expected == {0: 2}
-    for instance in (nobody, somebody):
-        instance.close()
+    instances.close()
 
 
 def test_a_network_comes_as_it_is(cloud, transport):

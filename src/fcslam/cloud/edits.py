@@ -84,12 +84,15 @@ def check_undo(edits: Sequence[Edit], number: int) -> None:
 def is_removed(session: str, changes: Iterable[Change]) -> bool:
     """Whether one of the changes removes the session of this name."""
     robot, epoch = robot_and_epoch(session)
-    return any(isinstance(change, Removal) and change.covers(robot, epoch) for change in changes)
+    return any(
+        isinstance(change, Removal) and change.robot == robot and change.epoch in (None, epoch) for change in changes
+    )
 
 
 def is_cut(session: str, stamp: float, changes: Iterable[Change]) -> bool:
     """Whether one of the changes cuts the session's keyscan with this stamp."""
-    return any(isinstance(change, Cut) and change.covers(session, stamp) for change in changes)
+    cuts = [change for change in changes if isinstance(change, Cut) and change.session == session]
+    return any(cut.first_s <= stamp <= cut.last_s for cut in cuts)
 
 
 def floors(changes: Iterable[Change]) -> dict[str, str]:

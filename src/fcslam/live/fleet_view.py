@@ -6,7 +6,7 @@ A thread follows the cloud. No scan waits for it, and while the cloud is away ev
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -64,7 +64,7 @@ class FleetView:
 
     def __init__(
         self,
-        clients: Sequence[FleetClient],
+        client: FleetClient,
         robot: str,
         own_pose: Callable[[], tuple[int, FloatArray] | None],
         limit_kBps: float | None = None,
@@ -73,13 +73,13 @@ class FleetView:
         """Follow nothing before ``start``.
 
         Args:
-            clients: of the cloud's instances; if one does not answer, the next one is asked. ``close`` closes them.
+            client: of the cloud; ``close`` closes it.
             robot: its name.
             own_pose: index of its map and its pose there, if both are known.
             limit_kBps: limit of the tiles, kB per second; None: ``DOWNLINK_KB_PER_S``.
             clock: any, in seconds.
         """
-        self._clients, self._robot, self._own_pose, self.clock = clients, robot, own_pose, clock
+        self._client, self._robot, self._own_pose, self.clock = client, robot, own_pose, clock
         self._rng = np.random.default_rng()  # robots must not retry at the same moments
         self._limit_bytes = min(max(1, int(1e3 * POLL_S * (limit_kBps or DOWNLINK_KB_PER_S))), LARGEST_ANSWER)
         self._tiled, self._etag = TiledMap(), ""
@@ -104,7 +104,7 @@ class FleetView:
         self._frontiers_s = self._quality_s = -np.inf
         self.trouble: str | None = None
         """Why the cloud cannot be followed; None if it can."""
-        self._current = self._failures = 0
+        self._failures = 0
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -118,13 +118,12 @@ class FleetView:
         self._stop.set()
         if self._thread is not None:
             self._thread.join(STOP_TIMEOUT_S)
-        for client in self._clients:
-            client.close()
+        self._client.close()
 
     @property
     def received_bytes(self) -> int:
         """Bytes of the cloud's replies so far."""
-        return sum(client.received_bytes for client in self._clients)
+        return self._client.received_bytes
 
     @property
     def map_index(self) -> int | None:
@@ -149,7 +148,7 @@ class FleetView:
 
     def step(self) -> None:
         """Ask once."""
-        client, own = self._clients[self._current], self._own_pose()
+        client, own = self._client, self._own_pose()
         pose = None if own is None or not np.isfinite(own[1]).all() else tuple(own[1].tolist())
         reply = client.exchange(self._robot, None if own is None else own[0], pose), self.clock()
         stamp = next((one.stamp for one in reply[0].robots if one.robot == self._robot), -np.inf)
@@ -187,7 +186,6 @@ class FleetView:
                 self.step()
                 self.trouble, self._failures, wait_s = None, 0, POLL_S
             except FcslamError as error:  # the cloud is away, or older than this program
-                self._current = (self._current + 1) % len(self._clients)
                 self.trouble, self._failures = str(error), self._failures + 1
                 wait_s = getattr(error, "retry_after_s", 0.0) + POLL_S + retry_delay_s(self._failures, self._rng)
 

@@ -17,7 +17,7 @@ from fcslam.lidar.tracker import SEARCH_SIGMA_M, TrackedScan, weakest_sigma_m
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.backend_runner import worker_process
 from fcslam.robot.uplink import UplinkStatus
-from fcslam.wire.http_transport import BatchTransport
+from fcslam.wire.http_transport import HttpTransport
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,7 +202,7 @@ class Wiring(NamedTuple):
     keeps_keyframes: bool = False
     """Whether the keyframes of the camera stay in the state folder, for a process that learns from them; the next start
     removes them."""
-    transport: BatchTransport | None = None
+    transport: HttpTransport | None = None
     """Connection to a cloud of a test. None: that to the robot's server, if it has one."""
 
     def started(self, stack: ExitStack) -> Executor:

@@ -53,7 +53,7 @@ from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.warmup import warm_up_tracking
 from fcslam.wire.checks import check_floor
 from fcslam.wire.fleet_client import FleetClient
-from fcslam.wire.http_transport import HttpTransport, InstancesTransport, Server, addresses
+from fcslam.wire.http_transport import HttpTransport, Server
 from fcslam.wire.keys import Credentials
 from fcslam.wire.messages import Packet
 
@@ -155,13 +155,10 @@ class Robot(LiveTracker):
             if folder is not None:
                 outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", name, LARGEST_OUTBOX_BYTES)))
             if access is not None and outbox is not None:
-                urls, shown = addresses(access.url), Credentials(access.token, access.ca, access.certificate)
-                transport = InstancesTransport(
-                    [stack.enter_context(closing(HttpTransport(url, name, outbox.agent, shown))) for url in urls]
-                )
+                shown = Credentials(access.token, access.ca, access.certificate)
+                transport = stack.enter_context(closing(HttpTransport(access.url, name, outbox.agent, shown)))
                 if own_map:
-                    followed = [FleetClient(url, shown) for url in urls]
-                    self.fleet = FleetView(followed, name, self._place, budget_kBps)
+                    self.fleet = FleetView(FleetClient(access.url, shown), name, self._place, budget_kBps)
                     stack.enter_context(closing(self.fleet)).start()
                     self._joint = JointMap(self.fleet, self._config.map)
             known = 0 if outbox is None else outbox.begin(*wiring.playback)

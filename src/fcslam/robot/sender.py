@@ -9,7 +9,7 @@ import numpy as np
 from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
 from fcslam.records import Correction, DetectorFile
 from fcslam.robot.outbox import Outbox, PacketBatch
-from fcslam.wire.http_transport import BatchTransport, CloudState, HttpResponse
+from fcslam.wire.http_transport import CloudState, HttpResponse, HttpTransport
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate
 from fcslam.wire.packets import decode
@@ -38,7 +38,7 @@ class Sender:
     def __init__(
         self,
         outbox: Outbox,
-        transport: BatchTransport,
+        transport: HttpTransport,
         rng: np.random.Generator,
         clock: Callable[[], float],
         correct: Callable[[int, Correction], None],
@@ -154,9 +154,9 @@ class Sender:
         self._read(reply)
         self.removed_notice = REMOVED if reply.removed else None
         if batch is not None and reply.refusal is not None:
-            sequence = batch.first + reply.refusal.index
+            sequence = batch.first + reply.refusal[0]
             self.confirmed += self._outbox.acknowledge(batch.epoch, sequence - 1)
-            self._set_aside(batch.epoch, sequence, reply.refusal.reason)
+            self._set_aside(batch.epoch, sequence, reply.refusal[1])
             self._known_refusals += 1  # read here, so the whole list need not be requested
         if reply.refusal is None and reply.refused != self._known_refusals:
             self._read_refusals(self._transport.state())

@@ -20,7 +20,7 @@ from fcslam.robot.detector_updates import DetectorUpdates
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.outbox import Outbox, WaitingPackets
 from fcslam.robot.sender import Sender
-from fcslam.wire.http_transport import BatchTransport
+from fcslam.wire.http_transport import HttpTransport
 from fcslam.wire.messages import Packet
 
 STOP_TIMEOUT_S = 2.0
@@ -54,7 +54,7 @@ class Uplink:
         self,
         frontend: RobotFrontend,
         outbox: Outbox,
-        transport: BatchTransport | None,
+        transport: HttpTransport | None,
         folder: Path,
         rng: np.random.Generator,
         clock: Callable[[], float],

@@ -1,14 +1,14 @@
 """Conversion between records and protobuf messages, with writing and reading side by side."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from google.protobuf.message import Message
 
 from fcslam.errors import PacketError
 from fcslam.records import (
-    CODE_BYTES,
+    SWEEP_STEPS,
     Beams,
     Channel,
     Constraint,
@@ -53,6 +53,10 @@ _CONSTRAINT_KINDS = {
     ConstraintKind.ODOMETRY: pb.CONSTRAINT_KIND_ODOMETRY,
     ConstraintKind.CLOSURE: pb.CONSTRAINT_KIND_CLOSURE,
 }
+_OF_LASER = "beam_count", "angle_min_rad", "angle_increment_rad", "max_range_m"
+_OF_PLACE = "detector_version", "first", "last"
+_OF_FIX = "latitude_deg", "longitude_deg", "altitude_m", "sigma_m"
+_OF_FILE = "version", "format", "size", "sha256"
 _CHANNEL_OF_CODE = {int(code): channel for channel, code in _CHANNELS.items()}
 _CONSTRAINT_KIND_OF_CODE = {int(code): kind for kind, code in _CONSTRAINT_KINDS.items()}
 
@@ -81,20 +85,12 @@ def _read_hello(message: pb.Hello, envelope: pb.Packet) -> Hello:
 
 
 def _write_laser(laser: LaserModel) -> pb.Laser:
-    return pb.Laser(
-        beam_count=laser.beam_count,
-        angle_min_rad=laser.angle_min_rad,
-        angle_increment_rad=laser.angle_increment_rad,
-        max_range_m=laser.max_range_m,
-        t_base_laser=_write_pose(frozen(laser.T_base_laser)),
-    )
+    return pb.Laser(**_values(laser, _OF_LASER), t_base_laser=_write_pose(frozen(laser.T_base_laser)))
 
 
 def _read_laser(message: pb.Laser) -> LaserModel:
     x, y, theta = _read_pose(message, "t_base_laser").tolist()
-    return LaserModel(
-        message.beam_count, message.angle_min_rad, message.angle_increment_rad, message.max_range_m, (x, y, theta)
-    )
+    return LaserModel(**_values(message, _OF_LASER), T_base_laser=(x, y, theta))
 
 
 def _write_keyscan(keyscan: Keyscan) -> pb.Keyscan:
@@ -116,8 +112,8 @@ def _read_keyscan(message: pb.Keyscan, envelope: pb.Packet) -> Keyscan:
     beams = None
     if message.HasField("beams"):
         beams = Beams(message.count, message.beams.angle_min_rad, message.beams.angle_increment_rad)
-    if len(message.sweep) not in (0, limits.SWEEP_NUMBERS):
-        raise PacketError(f"keyscan: sweep has {len(message.sweep)} numbers, not {limits.SWEEP_NUMBERS}")
+    if len(message.sweep) not in (0, len(SWEEP_STEPS)):
+        raise PacketError(f"keyscan: sweep has {len(message.sweep)} numbers, not {len(SWEEP_STEPS)}")
     sweep = Sweep.of_steps(message.sweep) if message.sweep else None
     return Keyscan(KeyscanId(envelope.robot, message.number), message.stamp, ranges, message.laser, beams, sweep)
 
@@ -153,12 +149,10 @@ def _write_place(place: Place) -> pb.Place:
     return pb.Place(
         number=place.id.number,
         channel=_CHANNELS[place.channel],
-        detector_version=place.detector_version,
-        first=place.first,
-        last=place.last,
         count=len(codes),
         keypoints=pack_keypoints(codes[order]),
         descriptors=pack_descriptors(place.descriptors[order]),
+        **_values(place, _OF_PLACE),
     )
 
 
@@ -167,13 +161,11 @@ def _read_place(message: pb.Place, envelope: pb.Packet) -> Place:
     channel = read_channel(message.channel)
     codes = unpack_keypoints(message.keypoints, message.count, limits.KEYPOINT_AXES[channel])
     return Place(
-        KeyscanId(envelope.robot, message.number),
-        channel,
-        message.detector_version,
-        message.first,
-        message.last,
-        dequantise_keypoints(codes),
-        frozen(unpack_descriptors(message.descriptors, message.count), np.uint8),
+        id=KeyscanId(envelope.robot, message.number),
+        channel=channel,
+        keypoints=dequantise_keypoints(codes),
+        descriptors=frozen(unpack_descriptors(message.descriptors, message.count), np.uint8),
+        **_values(message, _OF_PLACE),
     )
 
 
@@ -200,26 +192,12 @@ def _read_tag_sighting(message: pb.TagSighting, envelope: pb.Packet) -> TagSight
 
 def _write_fix(fix: KeyscanFix) -> pb.KeyscanFix:
     x, y = fix.antenna_xy
-    return pb.KeyscanFix(
-        number=fix.id.number,
-        latitude_deg=fix.latitude_deg,
-        longitude_deg=fix.longitude_deg,
-        altitude_m=fix.altitude_m,
-        sigma_m=fix.sigma_m,
-        antenna_x_m=x,
-        antenna_y_m=y,
-    )
+    return pb.KeyscanFix(number=fix.id.number, antenna_x_m=x, antenna_y_m=y, **_values(fix, _OF_FIX))
 
 
 def _read_fix(message: pb.KeyscanFix, envelope: pb.Packet) -> KeyscanFix:
-    return KeyscanFix(
-        KeyscanId(envelope.robot, message.number),
-        message.latitude_deg,
-        message.longitude_deg,
-        message.altitude_m,
-        message.sigma_m,
-        (message.antenna_x_m, message.antenna_y_m),
-    )
+    antenna_xy = message.antenna_x_m, message.antenna_y_m
+    return KeyscanFix(KeyscanId(envelope.robot, message.number), antenna_xy=antenna_xy, **_values(message, _OF_FIX))
 
 
 def _check_at_most(count: int, most: int, what: str) -> None:
@@ -251,16 +229,16 @@ def _read_acknowledgement(message: pb.Acknowledgement, envelope: pb.Packet) -> A
 
 
 def _write_detector_update(update: DetectorUpdate) -> pb.DetectorUpdate:
-    file = update.file
-    return pb.DetectorUpdate(
-        channel=_CHANNELS[file.channel], version=file.version, format=file.format, size=file.size, sha256=file.sha256
-    )
+    return pb.DetectorUpdate(channel=_CHANNELS[update.file.channel], **_values(update.file, _OF_FILE))
 
 
 def _read_detector_update(message: pb.DetectorUpdate, envelope: pb.Packet) -> DetectorUpdate:
-    channel = read_channel(message.channel)
-    file = DetectorFile(channel, message.version, message.format, message.size, message.sha256)
-    return DetectorUpdate(envelope.robot, file)
+    return DetectorUpdate(envelope.robot, DetectorFile(read_channel(message.channel), **_values(message, _OF_FILE)))
+
+
+def _values(source: object, names: tuple[str, ...]) -> dict[str, Any]:
+    """The fields that a record and its message have in common."""
+    return {name: getattr(source, name) for name in names}
 
 
 def _write_pose(pose: FloatArray) -> pb.Pose:
@@ -284,40 +262,16 @@ def read_channel(code: int) -> Channel:
     return channel
 
 
-def _always(number: int) -> Callable[[Any], int]:
-    return lambda _: number
-
-
-def _for_each(size: int, most: int) -> Callable[[Any], int]:
-    """Bytes of a message's streams with ``size`` for each item; more than ``most`` are refused before."""
-    return lambda message: size * min(message.count, most)
-
-
-_KEYPOINT_BYTES = limits.BYTES_PER_AXIS * max(limits.KEYPOINT_AXES.values())
-_RANGES = _for_each(limits.BYTES_PER_RANGE, limits.MAXIMUM_BEAMS)
-_DESCRIBED = _for_each(_KEYPOINT_BYTES + CODE_BYTES, limits.MAXIMUM_KEYPOINTS)
-
-
-class Codec(NamedTuple):
-    """One kind of record. Its reader takes robot and epoch from the envelope."""
-
-    type: type
-    write: Callable[[Any], Message]
-    read: Callable[[Any, pb.Packet], Any]
-    unpacked_bytes: Callable[[Any], int] = _always(0)
-    """Bytes of the streams of a message, unpacked, by its counts."""
-
-
-CODECS = {
-    PacketKind.HELLO: Codec(Hello, _write_hello, _read_hello),
-    PacketKind.KEYSCAN: Codec(Keyscan, _write_keyscan, _read_keyscan, _RANGES),
-    PacketKind.CONSTRAINT: Codec(Constraint, _write_constraint, _read_constraint),
-    PacketKind.PLACE: Codec(Place, _write_place, _read_place, _DESCRIBED),
-    PacketKind.TAG_SIGHTING: Codec(TagSighting, _write_tag_sighting, _read_tag_sighting),
-    PacketKind.KEYSCAN_FIX: Codec(KeyscanFix, _write_fix, _read_fix),
-    PacketKind.CORRECTION: Codec(Correction, _write_correction, _read_correction),
-    PacketKind.ACKNOWLEDGEMENT: Codec(Acknowledgement, _write_acknowledgement, _read_acknowledgement),
-    PacketKind.DETECTOR_UPDATE: Codec(DetectorUpdate, _write_detector_update, _read_detector_update),
+CODECS: dict[PacketKind, tuple[type, Callable[[Any], Message], Callable[[Any, pb.Packet], Any]]] = {
+    PacketKind.HELLO: (Hello, _write_hello, _read_hello),
+    PacketKind.KEYSCAN: (Keyscan, _write_keyscan, _read_keyscan),
+    PacketKind.CONSTRAINT: (Constraint, _write_constraint, _read_constraint),
+    PacketKind.PLACE: (Place, _write_place, _read_place),
+    PacketKind.TAG_SIGHTING: (TagSighting, _write_tag_sighting, _read_tag_sighting),
+    PacketKind.KEYSCAN_FIX: (KeyscanFix, _write_fix, _read_fix),
+    PacketKind.CORRECTION: (Correction, _write_correction, _read_correction),
+    PacketKind.ACKNOWLEDGEMENT: (Acknowledgement, _write_acknowledgement, _read_acknowledgement),
+    PacketKind.DETECTOR_UPDATE: (DetectorUpdate, _write_detector_update, _read_detector_update),
 }
-"""All that depends on the kind of a packet, but for its checks (``fcslam.wire.checks``)."""
-CODEC_OF_TYPE = {codec.type: (kind, codec) for kind, codec in CODECS.items()}
+"""The record of each kind, what writes it, and what reads it with the robot and epoch of its envelope."""
+KIND_OF_TYPE = {record: kind for kind, (record, _, _) in CODECS.items()}

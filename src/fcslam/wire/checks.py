@@ -1,7 +1,7 @@
 """Validation of packets: the same checks before writing and after reading."""
 
 import math
-from collections.abc import Callable
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -28,19 +28,83 @@ from fcslam.wire import limits
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise
 
-_OF_KEYSCANS = Keyscan | Place | TagSighting | KeyscanFix
+_NUMBER = 0, 2**31 - 1
+"""Numbers of keyscans, versions and maps."""
+_ABOVE_0 = math.ulp(0.0)
+_EPOCH, _SEQUENCE = (0, limits.MAXIMUM_EPOCH), (0, limits.MAXIMUM_SEQUENCE)
+
+_BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
+    Packet: {"epoch": _EPOCH, "sequence": _SEQUENCE, "time": (-math.inf, math.inf)},
+    Beams: {
+        "beam_count": (1, limits.MAXIMUM_BEAMS),
+        "angle_min_rad": (-FULL_TURN_RAD, FULL_TURN_RAD),
+        "angle_increment_rad": (-FULL_TURN_RAD, FULL_TURN_RAD),
+    },
+    LaserModel: {"max_range_m": (_ABOVE_0, limits.MAXIMUM_LASER_RANGE_M)},
+    Sweep: {"first_s": (-2.0, 2.0), "last_s": (-2.0, 2.0)},
+    Keyscan: {"id.number": _NUMBER, "laser": (0, limits.MAXIMUM_LASERS - 1)},
+    Constraint: {"i": _NUMBER, "j": _NUMBER},
+    Place: {"id.number": _NUMBER, "first": _NUMBER, "last": _NUMBER},
+    TagSighting: {"id.number": _NUMBER, "tag.number": (0, 4095)},
+    KeyscanFix: {
+        "id.number": _NUMBER,
+        "latitude_deg": (-90.0, 90.0),
+        "longitude_deg": (-360.0, 360.0),
+        "altitude_m": (-1e5, 1e5),
+        "sigma_m": (_ABOVE_0, 1e4),
+    },
+    Correction: {"version": _NUMBER, "map_index": _NUMBER, "quality": (0.0, 1.0)},
+    Acknowledgement: {"epoch": _EPOCH, "sequence": _SEQUENCE},
+    DetectorUpdate: {"file.format": _NUMBER, "file.size": (1, limits.MAXIMUM_NETWORK_BYTES)},
+}
+"""Lowest and highest value of each number of a record."""
+_MOST_MOTION = 50.0, 500.0
+"""Largest velocity and acceleration during a scan: m/s and rad/s, m/s^2 and rad/s^2."""
+_ANTENNA_M = 1000.0
+"""Largest distance of an antenna from the base of a keyscan."""
 
 
 def check(packet: Packet) -> None:
     """Refuse a packet that violates the format."""
+    body = packet.body
     check_name(packet.robot, "robot")
-    _check_count(packet.epoch, "epoch", limits.MAXIMUM_EPOCH)
-    _check_count(packet.sequence, "sequence", limits.MAXIMUM_SEQUENCE)
+    _check_numbers(packet)
     _require(math.isfinite(packet.time), "time is not finite")
-    robot = packet.body.id.robot if isinstance(packet.body, _OF_KEYSCANS) else packet.body.robot
+    robot = body.id.robot if isinstance(body, Keyscan | Place | TagSighting | KeyscanFix) else body.robot
     if robot != packet.robot:
         raise PacketError(f"a packet of robot {packet.robot} holds a record of robot {robot!r}")
-    _CHECKS[type(packet.body)](packet.body, packet)
+    _check_numbers(body)
+    match body:
+        case Hello():
+            _require(body.epoch == packet.epoch, f"hello: epoch {body.epoch} in a packet of epoch {packet.epoch}")
+            _check_hello(body)
+        case Keyscan():
+            _check_keyscan(body)
+            _require(body.stamp <= packet.time, "keyscan: stamp is later than the packet's time")
+        case Constraint():
+            _require(body.i < body.j, f"constraint: i = {body.i} is not below j = {body.j}")
+            _check_pose(body.T_i_j, "constraint: T_i_j", math.pi)
+            _check_information(body.information, "constraint")
+        case Place():
+            _check_place(body)
+        case TagSighting():
+            _check_pose(body.T_base_tag, "tag sighting: T_base_tag", math.pi)
+            _check_information(body.information, "tag sighting")
+        case KeyscanFix():
+            is_near = math.hypot(*body.antenna_xy) <= _ANTENNA_M
+            _require(is_near, f"fix: the antenna is not within {_ANTENNA_M:g} m of the robot")
+        case Correction():
+            _check_pose(body.T_map_odom, "correction: T_map_odom", math.pi)
+        case DetectorUpdate():
+            check_name(body.file.version, "detector update: detector version")
+            _require(len(body.file.sha256) == 32, f"detector update: sha256 has {len(body.file.sha256)} bytes, not 32")
+
+
+def _check_numbers(record: object) -> None:
+    for path, (low, high) in _BOUNDS.get(type(record), {}).items():
+        value = attrgetter(path)(record)
+        if not low <= value <= high:  # true for NaN
+            raise PacketError(f"{type(record).__name__}: {path} is {value}, not in {low:.7g}..{high:.7g}")
 
 
 def check_name(name: str, what: str) -> None:
@@ -49,8 +113,7 @@ def check_name(name: str, what: str) -> None:
         raise PacketError(f"{what}: {name[:64]!r} is not a name (1-64 of A-Z a-z 0-9 . _ + -)")
 
 
-def _check_hello(hello: Hello, packet: Packet) -> None:
-    _require(hello.epoch == packet.epoch, f"hello: epoch {hello.epoch} in a packet of epoch {packet.epoch}")
+def _check_hello(hello: Hello) -> None:
     count = len(hello.lasers)
     _require(0 < count <= limits.MAXIMUM_LASERS, f"hello: {count} lasers, not in 1..{limits.MAXIMUM_LASERS}")
     for laser in hello.lasers:
@@ -67,33 +130,26 @@ def check_floor(floor: str) -> None:
 
 
 def _check_laser(laser: LaserModel) -> None:
-    _check_beams(laser.beams, "laser")
-    _require(0.0 < laser.max_range_m <= limits.MAXIMUM_LASER_RANGE_M, "laser: maximum range is not in (0, 1000] m")
+    _check_beams(laser.beams)
+    _check_numbers(laser)
     _check_pose(np.array(laser.T_base_laser), "laser: T_base_laser")
 
 
-def _check_beams(beams: Beams, what: str) -> None:
-    count, first, increment = beams
-    _require(0 < count <= limits.MAXIMUM_BEAMS, f"{what}: {count} beams, not in 1..{limits.MAXIMUM_BEAMS}")
-    _require(abs(first) <= FULL_TURN_RAD, f"{what}: first beam is not within a full turn")
-    turns = 0.0 < abs(increment) <= FULL_TURN_RAD
-    _require(turns, f"{what}: beams do not turn, or by more than a full turn")
-    within = abs(increment) * (count - 1) <= LARGEST_SPAN_RAD
-    _require(within, f"{what}: beams cover over a full turn")
+def _check_beams(beams: Beams) -> None:
+    _check_numbers(beams)
+    _require(beams.angle_increment_rad != 0.0, "beams do not turn")
+    _require(abs(beams.span_rad) <= LARGEST_SPAN_RAD, "beams cover over a full turn")
 
 
-def _check_keyscan(keyscan: Keyscan, packet: Packet) -> None:
-    _check_count(keyscan.id.number, "keyscan: number")
+def _check_keyscan(keyscan: Keyscan) -> None:
     _require(math.isfinite(keyscan.stamp), "keyscan: stamp is not finite")
-    _require(keyscan.stamp <= packet.time, "keyscan: stamp is later than the packet's time")
     ranges = keyscan.ranges_m
     _require(ranges.ndim == 1, f"keyscan: ranges have shape {ranges.shape}, not (N,)")
     _require(len(ranges) <= limits.MAXIMUM_BEAMS, f"keyscan: {len(ranges)} ranges, at most {limits.MAXIMUM_BEAMS}")
     if not np.array_equal(ranges, dequantise(quantise(ranges))):
         raise PacketError("keyscan: ranges are not quantised; work with dequantise(quantise(ranges_m))")
-    _check_count(keyscan.laser, "keyscan: laser", limits.MAXIMUM_LASERS - 1)
     if keyscan.beams is not None:
-        _check_beams(keyscan.beams, "keyscan")
+        _check_beams(keyscan.beams)
         count = keyscan.beams.beam_count
         _require(count == len(ranges), f"keyscan: {len(ranges)} ranges of {count} beams")
     if keyscan.sweep is not None:
@@ -101,22 +157,12 @@ def _check_keyscan(keyscan: Keyscan, packet: Packet) -> None:
 
 
 def _check_sweep(sweep: Sweep) -> None:
-    times = sweep.first_s, sweep.last_s
-    within = all(abs(t) <= limits.MAXIMUM_BEAM_TIME_S for t in times) and sweep.first_s != sweep.last_s
-    _require(within, f"keyscan: beams at {times} s, not two times within {limits.MAXIMUM_BEAM_TIME_S:g} s of the stamp")
-    slow = all(abs(number) <= limits.MAXIMUM_SPEED for number in sweep.velocity)
-    _require(slow, f"keyscan: the velocity in the sweep exceeds {limits.MAXIMUM_SPEED:g} m/s or rad/s")
-    steady = all(abs(number) <= limits.MAXIMUM_ACCELERATION for number in sweep.acceleration)
-    _require(steady, f"keyscan: the acceleration in the sweep exceeds {limits.MAXIMUM_ACCELERATION:g} m/s^2 or rad/s^2")
+    _check_numbers(sweep)
+    _require(sweep.first_s != sweep.last_s, "keyscan: all beams are at one time")
+    for name, numbers, most in zip(("velocity", "acceleration"), sweep[2:], _MOST_MOTION, strict=True):
+        within = all(abs(number) <= most for number in numbers)
+        _require(within, f"keyscan: the {name} in the sweep exceeds {most:g}")
     _require(sweep == sweep.rounded(), "keyscan: the sweep is not in steps of the wire; work with Sweep.rounded()")
-
-
-def _check_constraint(constraint: Constraint, _: Packet) -> None:
-    _check_count(constraint.i, "constraint: i")
-    _check_count(constraint.j, "constraint: j")
-    _require(constraint.i < constraint.j, f"constraint: i = {constraint.i} is not below j = {constraint.j}")
-    _check_pose(constraint.T_i_j, "constraint: T_i_j", math.pi)
-    _check_information(constraint.information, "constraint")
 
 
 def _check_information(information: FloatArray, what: str) -> None:
@@ -144,10 +190,7 @@ def _exceeds(limit: float, xy: float, xt: float, yt: float) -> bool:
     return second > 0.0 and first - xt * xt / first - rest * rest / second > 0.0
 
 
-def _check_place(place: Place, _: Packet) -> None:
-    _check_count(place.id.number, "place: number")
-    _check_count(place.first, "place: first")
-    _check_count(place.last, "place: last")
+def _check_place(place: Place) -> None:
     _require(place.first <= place.last, f"place: first = {place.first} is after last = {place.last}")
     within = place.first <= place.id.number <= place.last
     _require(within, f"place: number = {place.id.number} is not in {place.first}..{place.last}")
@@ -161,61 +204,6 @@ def _check_place(place: Place, _: Packet) -> None:
     _require(place.descriptors.dtype == np.uint8, f"place: descriptors are {place.descriptors.dtype}, not bytes")
 
 
-def _check_tag_sighting(sighting: TagSighting, _: Packet) -> None:
-    _check_count(sighting.id.number, "tag sighting: number")
-    _check_count(sighting.tag.number, "tag sighting: tag", limits.MAXIMUM_TAG)
-    _check_pose(sighting.T_base_tag, "tag sighting: T_base_tag", math.pi)
-    _check_information(sighting.information, "tag sighting")
-
-
-def _check_fix(fix: KeyscanFix, _: Packet) -> None:
-    _check_count(fix.id.number, "fix: number")
-    # false for NaN
-    latitude, longitude = fix.latitude_deg, fix.longitude_deg
-    is_on_earth = abs(latitude) <= limits.MAXIMUM_LATITUDE_DEG and abs(longitude) <= limits.MAXIMUM_LONGITUDE_DEG
-    _require(is_on_earth, f"fix: latitude {latitude:g}, longitude {longitude:g} are not on the earth")
-    _require(abs(fix.altitude_m) <= limits.MAXIMUM_ALTITUDE_M, f"fix: an altitude of {fix.altitude_m:g} m")
-    is_known = 0.0 < fix.sigma_m <= limits.MAXIMUM_FIX_SIGMA_M
-    _require(is_known, f"fix: a standard deviation of {fix.sigma_m:g} m, not in 0..{limits.MAXIMUM_FIX_SIGMA_M:g}")
-    is_near = math.hypot(*fix.antenna_xy) <= limits.MAXIMUM_ANTENNA_M
-    _require(is_near, f"fix: the antenna is not within {limits.MAXIMUM_ANTENNA_M:g} m of the robot")
-
-
-def _check_correction(correction: Correction, _: Packet) -> None:
-    _check_count(correction.version, "correction: version")
-    _check_count(correction.map_index, "correction: map index")
-    _check_pose(correction.T_map_odom, "correction: T_map_odom", math.pi)
-    _require(0.0 <= correction.quality <= 1.0, f"correction: quality {correction.quality} is not within 0 and 1")
-
-
-def _check_acknowledgement(acknowledgement: Acknowledgement, _: Packet) -> None:
-    _check_count(acknowledgement.epoch, "acknowledgement: epoch", limits.MAXIMUM_EPOCH)
-    _check_count(acknowledgement.sequence, "acknowledgement: sequence", limits.MAXIMUM_SEQUENCE)
-
-
-def _check_detector_update(update: DetectorUpdate, _: Packet) -> None:
-    file = update.file
-    check_name(file.version, "detector update: detector version")
-    _check_count(file.format, "detector update: format")
-    within = 0 < file.size <= limits.MAXIMUM_NETWORK_BYTES
-    _require(within, f"detector update: a file of {file.size} bytes, not of 1..{limits.MAXIMUM_NETWORK_BYTES}")
-    sized = len(file.sha256) == limits.DIGEST_BYTES
-    _require(sized, f"detector update: sha256 has {len(file.sha256)} bytes, not {limits.DIGEST_BYTES}")
-
-
-_CHECKS: dict[type, Callable[[Any, Packet], None]] = {
-    Hello: _check_hello,
-    Keyscan: _check_keyscan,
-    Constraint: _check_constraint,
-    Place: _check_place,
-    TagSighting: _check_tag_sighting,
-    KeyscanFix: _check_fix,
-    Correction: _check_correction,
-    Acknowledgement: _check_acknowledgement,
-    DetectorUpdate: _check_detector_update,
-}
-
-
 def _check_pose(pose: FloatArray, what: str, maximum_angle_rad: float = FULL_TURN_RAD) -> None:
     _check_shape(pose, (3,), what)
     x, y, theta = pose.tolist()
@@ -227,11 +215,6 @@ def _check_pose(pose: FloatArray, what: str, maximum_angle_rad: float = FULL_TUR
 def _check_shape(array: NDArray[Any], shape: tuple[int, ...], what: str) -> None:
     if array.shape != shape:
         raise PacketError(f"{what} have shape {array.shape}, not {shape}")
-
-
-def _check_count(value: int, what: str, maximum: int = limits.MAXIMUM_NUMBER) -> None:
-    if not 0 <= value <= maximum:
-        raise PacketError(f"{what} is {value}, not in 0..{maximum}")
 
 
 def _require(condition: bool, reason: str) -> None:

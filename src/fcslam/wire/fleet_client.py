@@ -16,7 +16,7 @@ _FRONTIERS, _QUALITY = TypeAdapter(tuple[MapFrontiers, ...]), TypeAdapter(tuple[
 
 
 class FleetClient(HttpClient):
-    """Follows the fleet of one robot. Each method raises as ``BatchTransport.state``."""
+    """Follows the fleet of one robot. Each method raises as ``HttpTransport.state``."""
 
     received_bytes = 0
     """Bytes of the replies' bodies so far."""
@@ -74,7 +74,7 @@ class ServedMap(NamedTuple):
 
 
 class MapClient(HttpClient):
-    """Reads the maps of one cloud; it needs the rights of a viewer. Each method raises as ``BatchTransport.state``."""
+    """Reads the maps of one cloud; it needs the rights of a viewer. Each method raises as ``HttpTransport.state``."""
 
     def maps(self) -> list[ServedMap]:
         """The maps of the cloud now."""

@@ -2,10 +2,11 @@
 
 import ipaddress
 import ssl
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
 from fcslam.errors import CloudError, InputError, OversizeError, PacketError, UnavailableError
@@ -24,23 +25,10 @@ from fcslam.wire.keys import NO_CREDENTIALS, Credentials, no_passphrase
 if TYPE_CHECKING:
     import httpx
 
-_T = TypeVar("_T")
-
 CONNECT_TIMEOUT_S, ANSWER_TIMEOUT_S = 5.0, 30.0
 
 _LATER = frozenset({408, 425, 429, 500, 502, 503, 504, 507})
 """Status codes of a cloud, or a proxy before it, after which a retry may succeed."""
-
-
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """A packet of a batch that the cloud refuses for good; it keeps its sequence number.
-
-    Packets before it are stored, packets after it are not.
-    """
-
-    index: int
-    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +37,9 @@ class HttpResponse:
 
     packets: tuple[bytes, ...] = ()
     """Encoded packets from the cloud."""
-    refusal: Refusal | None = None
+    refusal: tuple[int, str] | None = None
+    """Index and reason of a packet that the cloud refuses for good; it keeps its sequence number. Packets before it are
+    stored, packets after it are not."""
     refused: int = 0
     """Number of the robot's refused packets so far; some were refused after they were stored."""
     removed: bool = False
@@ -86,51 +76,21 @@ class CloudState:
     """Reason of every refused packet, by epoch and sequence."""
 
 
-class BatchTransport(Protocol):
-    """Connection of a robot to the cloud."""
-
-    def state(self) -> CloudState:
-        """Ask the cloud which packets of this robot it has.
-
-        Raises:
-            UnavailableError: the cloud cannot be reached now.
-            CloudError: the cloud rejects this robot.
-        """
-
-    def send(self, packets: Sequence[bytes], correction: int) -> HttpResponse:
-        """Send a batch of encoded packets with the version of the newest correction (-1: none), and wait for the reply.
-
-        Without packets it only asks for news. A batch whose reply is lost has to be sent again.
-
-        Raises:
-            UnavailableError: no reply came, or the cloud is busy.
-            OversizeError: the batch is too large for the cloud.
-            CloudError: the cloud rejects this robot.
-        """
-
-    def detector(self, channel: Channel, version: str) -> bytes:
-        """Download the file of an announced detector.
-
-        Raises:
-            UnavailableError: the cloud cannot be reached now.
-            CloudError: there is no such version.
-        """
-
-
 class HttpClient:
-    """Connection to one cloud."""
+    """Connection to one cloud; where one of its instances does not answer, the next request asks the next one."""
 
     def __init__(self, url: str, shown: Credentials = NO_CREDENTIALS, headers: Mapping[str, str] | None = None) -> None:
         """Open a client; every request has the ``headers``.
 
         Raises:
-            CloudError: ``url`` is not an address or would send the token unencrypted; a file of ``shown`` cannot be
-                read.
+            CloudError: ``url`` is not an address, or those of instances with commas between them, or would send the
+                token unencrypted; a file of ``shown`` cannot be read.
         """
         import httpx
 
-        _check_url(url, shown)
-        self._url = url.rstrip("/")
+        self._urls = deque(address.rstrip("/") for address in addresses(url))
+        for address in self._urls:
+            _check_url(address, shown)
         self._has_own = shown.own is not None
         self._client = httpx.Client(
             base_url=f"{self._url}/api/v1/",
@@ -140,17 +100,17 @@ class HttpClient:
             trust_env=False,
         )
 
+    @property
+    def _url(self) -> str:
+        return self._urls[0]
+
     def close(self) -> None:
         """Close the connection."""
         self._client.close()
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
-        """Read a reply in this block.
-
-        Raises:
-            CloudError: the reply is not what an fcslam cloud sends.
-        """
+        """Read a reply in this block; a CloudError says that it is not what an fcslam cloud sends."""
         try:
             yield
         except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
@@ -164,9 +124,17 @@ class HttpClient:
         headers: Mapping[str, str] | None = None,
         passes: Collection[int] = (),
     ) -> "httpx.Response":
-        """The response, if its status is 200 or one of ``passes``; raises as ``BatchTransport.state``."""
-        with self._explained():
-            response = self._client.request(method, path, content=content, headers=headers)
+        """The response, if its status is 200 or one of ``passes``; raises as ``HttpTransport.state``."""
+        try:
+            with self._explained():
+                response = self._client.request(method, path, content=content, headers=headers)
+            return self._checked(response, passes)
+        except UnavailableError:
+            self._urls.rotate(-1)
+            self._client.base_url = f"{self._url}/api/v1/"
+            raise
+
+    def _checked(self, response: "httpx.Response", passes: Collection[int]) -> "httpx.Response":
         code = response.status_code
         if code == 200 or code in passes:
             return response
@@ -179,7 +147,7 @@ class HttpClient:
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
-        """Turn the client's errors into those of ``BatchTransport.state``."""
+        """Turn the client's errors into those of ``HttpTransport.state``."""
         import httpx
 
         try:
@@ -212,7 +180,7 @@ class HttpClient:
 
 
 class HttpTransport(HttpClient):
-    """Connection of one robot to one cloud; docs/howto/robot.md lists how it handles status codes."""
+    """Connection of one robot to its cloud; docs/howto/robot.md lists how it handles status codes."""
 
     def __init__(self, url: str, robot: str, agent: str, shown: Credentials = NO_CREDENTIALS) -> None:
         """Open a client; raises as ``HttpClient``. ``agent``: random, to distinguish two processes of one robot."""
@@ -220,7 +188,12 @@ class HttpTransport(HttpClient):
         self._robot = quote(robot, safe="")
 
     def state(self) -> CloudState:
-        """As in BatchTransport."""
+        """Ask the cloud which packets of this robot it has.
+
+        Raises:
+            UnavailableError: the cloud cannot be reached now, or is busy.
+            CloudError: the cloud rejects this robot.
+        """
         response = self._ask("GET", f"robots/{self._robot}/state")
         with self._reading():
             state = response.json()
@@ -229,7 +202,11 @@ class HttpTransport(HttpClient):
         return CloudState(expected, refused)
 
     def send(self, packets: Sequence[bytes], correction: int) -> HttpResponse:
-        """As in BatchTransport."""
+        """Send a batch of encoded packets with the version of the newest correction (-1: none), and wait for the reply.
+
+        Without packets it only asks for news. A batch whose reply is lost has to be sent again. It raises as ``state``,
+        and ``OversizeError`` for a batch that is too large for the cloud.
+        """
         response = self._ask(
             "POST",
             f"robots/{self._robot}/packets",
@@ -240,7 +217,7 @@ class HttpTransport(HttpClient):
         if response.status_code == 400:
             index = _detail(response).get("index")
             if isinstance(index, int) and 0 <= index < len(packets):
-                return HttpResponse(refusal=Refusal(index, self._reason(response)))
+                return HttpResponse(refusal=(index, self._reason(response)))
             raise UnavailableError(self._reason(response))  # the batch was corrupted on its way
         try:
             return HttpResponse(
@@ -252,39 +229,8 @@ class HttpTransport(HttpClient):
             raise UnavailableError(f"{self._url}: the reply is broken ({error})") from error
 
     def detector(self, channel: Channel, version: str) -> bytes:
-        """As in BatchTransport."""
+        """Download the file of an announced detector; raises as ``state``."""
         return self._ask("GET", f"detectors/{channel.value}/{quote(version, safe='')}").content
-
-
-class InstancesTransport:
-    """Connection of one robot to several instances of one cloud: where one does not answer, the next one is asked next.
-
-    As a robot repeats what was not answered, this loses nothing.
-    """
-
-    def __init__(self, instances: Sequence[HttpTransport]) -> None:
-        """``instances``: at least one, that of the first request first."""
-        self._instances = instances
-        self._current = 0
-
-    def state(self) -> CloudState:
-        """As in BatchTransport."""
-        return self._asked(lambda instance: instance.state())
-
-    def send(self, packets: Sequence[bytes], correction: int) -> HttpResponse:
-        """As in BatchTransport."""
-        return self._asked(lambda instance: instance.send(packets, correction))
-
-    def detector(self, channel: Channel, version: str) -> bytes:
-        """As in BatchTransport."""
-        return self._asked(lambda instance: instance.detector(channel, version))
-
-    def _asked(self, request: Callable[[HttpTransport], _T]) -> _T:
-        try:
-            return request(self._instances[self._current])
-        except UnavailableError:
-            self._current = (self._current + 1) % len(self._instances)
-            raise
 
 
 def addresses(given: str) -> tuple[str, ...]:

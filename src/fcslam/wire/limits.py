@@ -12,38 +12,18 @@ MAXIMUM_SEQUENCE = 2**63 - 1
 """Sequence numbers fit a signed 64-bit column."""
 MAXIMUM_EPOCH = 2**31 - 1
 """A robot that starts every second needs 68 years."""
-MAXIMUM_NUMBER = 2**31 - 1
-"""Numbers of keyscans, versions and maps."""
-
 MAXIMUM_LASERS = 8
 """Lasers of one robot."""
 MAXIMUM_BEAMS = 4096
 BYTES_PER_RANGE = 2
-SWEEP_NUMBERS = 8
-MAXIMUM_BEAM_TIME_S = 2.0
-MAXIMUM_SPEED = 50.0
-"""Largest speed of a robot during a scan, m/s and rad/s."""
-MAXIMUM_ACCELERATION = 500.0
-"""The same, m/s^2 and rad/s^2."""
 
 MAXIMUM_KEYPOINTS = 2048
 KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}
 """Coordinates of a keypoint; a camera sees how high it is, too."""
 BYTES_PER_AXIS = 2
 
-MAXIMUM_TAG = 4095
-"""Number of a tag; the largest family has 2320."""
-
-MAXIMUM_LATITUDE_DEG, MAXIMUM_LONGITUDE_DEG = 90.0, 360.0
-MAXIMUM_ALTITUDE_M = 1e5
-MAXIMUM_FIX_SIGMA_M = 1e4
-MAXIMUM_ANTENNA_M = 1000.0
-"""Distance of an antenna from the base of a keyscan."""
-
 MAXIMUM_NETWORK_BYTES = 64 * 1024 * 1024
 """Largest file of a detector; present ones have 0.5 to 5 MB."""
-DIGEST_BYTES = 32
-
 MAXIMUM_COORDINATE_M = 1e6
 MAXIMUM_LASER_RANGE_M = 1e3
 MAXIMUM_INFORMATION = 2.0**40

@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError
 
 from fcslam.errors import PacketError
-from fcslam.records import Channel, Place
+from fcslam.records import CODE_BYTES, Channel, Place
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire import limits
-from fcslam.wire.bodies import CODEC_OF_TYPE, CODECS, read_channel
+from fcslam.wire.bodies import CODECS, KIND_OF_TYPE, read_channel
 from fcslam.wire.checks import check, check_name
 from fcslam.wire.messages import Packet, PacketKind
 
@@ -29,8 +29,9 @@ def encode(packet: Packet) -> bytes:
         PacketError: the packet exceeds a limit of the format; the message says which.
     """
     check(packet)
-    kind, codec = CODEC_OF_TYPE[type(packet.body)]
-    body: dict[str, Any] = {kind: codec.write(packet.body)}
+    kind = KIND_OF_TYPE[type(packet.body)]
+    _, write, _ = CODECS[kind]
+    body: dict[str, Any] = {kind: write(packet.body)}
     message = pb.Packet(
         version=limits.VERSION,
         robot=packet.robot,
@@ -57,8 +58,7 @@ class SizedPacket(NamedTuple):
     def label(self) -> Label:
         """By which its traffic is counted."""
         body = self.packet.body
-        kind, _ = CODEC_OF_TYPE[type(body)]
-        return Label(self.packet.robot, kind, body.channel if isinstance(body, Place) else None)
+        return Label(self.packet.robot, KIND_OF_TYPE[type(body)], body.channel if isinstance(body, Place) else None)
 
 
 def measure(packet: Packet) -> SizedPacket:
@@ -74,8 +74,8 @@ def decode(data: bytes) -> Packet:
         PacketError: ``data`` is not a valid packet of this version; the message says why.
     """
     message, kind = _parse(data)
-    codec = CODECS[kind]
-    body = codec.read(getattr(message, kind), message)
+    _, _, read = CODECS[kind]
+    body = read(getattr(message, kind), message)
     packet = Packet(message.robot, message.epoch, message.sequence, message.time, body)
     check(packet)
     return packet
@@ -109,7 +109,12 @@ def unpacked_size(data: bytes) -> int:
         message, kind = _parse(data)
     except PacketError:
         return len(data)
-    return len(data) + CODECS[kind].unpacked_bytes(getattr(message, kind))
+    if kind is PacketKind.KEYSCAN:
+        return len(data) + limits.BYTES_PER_RANGE * min(message.keyscan.count, limits.MAXIMUM_BEAMS)
+    if kind is PacketKind.PLACE:
+        each = limits.BYTES_PER_AXIS * max(limits.KEYPOINT_AXES.values()) + CODE_BYTES
+        return len(data) + each * min(message.place.count, limits.MAXIMUM_KEYPOINTS)
+    return len(data)
 
 
 def read_number(data: bytes) -> tuple[str, int, int] | None:

@@ -32,7 +32,7 @@ from fcslam.service.http.robots import Name
 from fcslam.service.http.state import ViewerState
 from fcslam.service.map_layers import layers_of, map_shapes, walls_of
 from fcslam.service.viewed_mission import run_of
-from fcslam.untrusted import check_file, open_file, read_bytes
+from fcslam.untrusted import open_file, read_bytes
 
 MOST = 2**31 - 1
 """Largest number of a map or tile."""
@@ -205,7 +205,7 @@ def _folder_of(state: ViewerState) -> Path:
 def _existing(state: ViewerState, name: str) -> Path:
     folder = _folder_of(state)
     try:
-        check_file(folder / name, folder)
+        open_file(folder / name, folder).close()
     except OSError as error:
         raise HTTPException(404, f"there is no {name} that can be read ({error.strerror or error})") from error
     return folder / name

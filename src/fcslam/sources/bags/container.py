@@ -14,7 +14,7 @@ from fcslam.errors import SourceError
 from fcslam.sources.bags.codec import OLD_TRANSFORMS, TRANSFORMS
 from fcslam.sources.bags.records import MCAP_MAGIC, ROS1_MAGIC, SQLITE_MAGIC, DatabaseFile, RecordFile
 from fcslam.sources.logs.archive import translate_errors
-from fcslam.untrusted import check_file, open_file, open_zstd
+from fcslam.untrusted import open_file, open_zstd
 
 _METADATA, _ZSTD_SUFFIX = "metadata.yaml", ".zstd"
 _SUFFIXES = (".mcap", ".db3", ".bag", ".active")
@@ -83,7 +83,7 @@ class BagPart:
         self.path = path
         with translate_errors(path):
             if (path.parent / _METADATA).is_file():  # a bag from somebody else
-                check_file(path, path.parent)
+                open_file(path, path.parent).close()
             with open_file(path) as file:
                 head = file.read(len(SQLITE_MAGIC))
                 if path.suffix == _ZSTD_SUFFIX and head.startswith(ZSTD):

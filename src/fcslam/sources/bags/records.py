@@ -13,7 +13,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from fcslam.untrusted import MOST_CHUNKS_RATIO, MOST_STREAM_RATIO, check_unpacked, open_database, open_file, unpack
+from fcslam.untrusted import MOST_STREAM_RATIO, check_unpacked, open_database, open_file, unpack
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
 LARGEST_CHUNK_BYTES = 256_000_000
@@ -191,7 +191,7 @@ class RecordFile:
         if len(records) == chunk.size and crc and crc32(records) != crc:
             raise DamageError
         self._unpacked += len(records)
-        check_unpacked(self._size, self._unpacked, MOST_CHUNKS_RATIO)
+        check_unpacked(self._size, self._unpacked, MOST_STREAM_RATIO)
         self._chunks.append(chunk)
         yield from self._records(BytesIO(records), len(self._chunks) - 1)
         if len(records) < chunk.size:
