@@ -107,11 +107,7 @@ def run_recordings(
     processes: int,
     watch: Watch,
 ) -> Run:
-    """Map opened recordings, ``processes`` robots at a time, after a check that none is there twice.
-
-    Raises:
-        InputError: as ``run_mission`` does, or two recordings share scans.
-    """
+    """Map opened recordings, ``processes`` robots at a time, after a check that none is there twice."""
     check_robots(recordings)
     sources.check_copies(recordings)
     return run_mission(recordings, settings, watch, inputs, side_by_side(processes))
@@ -208,11 +204,7 @@ def changes(
 
 
 def split_recordings(recordings: list[Source], parts: int) -> list[Source]:
-    """Cut the only one of ``recordings`` into ``parts`` robots; with 1 part, all recordings stay as they are.
-
-    Raises:
-        SourceError: there are several recordings, or not enough scans.
-    """
+    """Cut the only one of ``recordings`` into ``parts`` robots; with 1 part, all recordings stay as they are."""
     if parts == 1:
         return recordings
     if len(recordings) != 1:
@@ -249,11 +241,7 @@ def _checked(source: Source) -> Source:
 
 
 def settings_of(config: MissionConfig | Mapping[str, Any] | StrPath | None) -> MissionConfig:
-    """A complete configuration from what a user gives.
-
-    Raises:
-        InputError: a key is unknown, a value is wrong, or the file cannot be read.
-    """
+    """A complete configuration from what a user gives."""
     if isinstance(config, str | os.PathLike):
         return load(MissionConfig, Path(config))
     content = config.model_dump() if isinstance(config, MissionConfig) else dict(config or {})

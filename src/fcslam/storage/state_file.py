@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.config import one_line
 from fcslam.errors import InputError
 from fcslam.storage.files import write_file
 from fcslam.untrusted import read_bytes
@@ -22,32 +23,22 @@ from fcslam.untrusted import read_bytes
 State = dict[str, Any]
 """JSON values and, below any depth of dictionaries with keys of text, arrays."""
 
-_ARRAY = ""
-"""The only key of a dictionary that stands for an array, with its number as its value; no name is empty."""
 _HASH_BYTES = 32
 _LIBRARIES = ("numpy", "scipy", "numba", "gtsam", "opencv-python-headless")
 
 
 def write_state(path: Path, fits: str, state: State) -> None:
-    """Write a state atomically.
+    """Write a state atomically; ``fits``: what it fits, a program of a version, for instance."""
+    arrays: dict[str, NDArray[Any]] = {}
 
-    Args:
-        path: the file; its folder exists.
-        fits: what the state fits: a program of a version, for instance.
-        state: what is written.
-    """
-    data = state_bytes(fits, state)
-    write_file(path, _hash(data) + data)
+    def number(array: NDArray[Any]) -> dict[str, str]:
+        arrays[str(len(arrays))] = array
+        return {"": str(len(arrays) - 1)}  # the only key in place of an array; no name is empty
 
-
-def state_bytes(fits: str, state: State) -> bytes:
-    """The content of a state's file, without a hash."""
-    arrays: list[NDArray[Any]] = []
-    text = json.dumps({"fits": fits, "state": _without_arrays(state, arrays)})
+    text = json.dumps({"fits": fits, "state": state}, default=number)
     content = io.BytesIO()
-    named = {str(number): array for number, array in enumerate(arrays)}
-    np.savez(content, allow_pickle=False, text=np.frombuffer(text.encode(), np.uint8), **named)
-    return content.getvalue()
+    np.savez(content, allow_pickle=False, text=np.frombuffer(text.encode(), np.uint8), **arrays)
+    write_file(path, _hash(content.getvalue()) + content.getvalue())
 
 
 def read_state(path: Path, fits: str) -> State | None:
@@ -58,26 +49,21 @@ def read_state(path: Path, fits: str) -> State | None:
     """
     try:
         data = read_bytes(path)
+        if _hash(data[_HASH_BYTES:]) != data[:_HASH_BYTES]:
+            raise InputError(f"{path}: is damaged")
+        with np.load(io.BytesIO(data[_HASH_BYTES:]), allow_pickle=False) as archive:
+            about: State = json.loads(
+                archive["text"].tobytes(),
+                object_hook=lambda found: archive[found[""]] if found.keys() == {""} else found,
+            )
     except FileNotFoundError:
         return None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error})") from error
-    if _hash(data[_HASH_BYTES:]) != data[:_HASH_BYTES]:
-        raise InputError(f"{path}: is damaged")
-    return parse_state(path, data[_HASH_BYTES:], fits)
-
-
-def parse_state(path: Path, data: bytes, fits: str) -> State:
-    """Read what ``state_bytes`` gave, found at ``path``."""
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            about = json.loads(archive["text"].tobytes())
-            if about["fits"] != fits:
-                raise InputError(f"{path}: is of another version or configuration")
-            state: State = _with_arrays(about["state"], archive)
-            return state
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: cannot be read ({' '.join(str(error).split())})") from error
+        raise InputError(f"{path}: cannot be read ({one_line(str(error))})") from error
+    if about["fits"] != fits:
+        raise InputError(f"{path}: is of another version or configuration")
+    state: State = about["state"]
+    return state
 
 
 @cache
@@ -92,19 +78,3 @@ def code_version() -> str:
 
 def _hash(data: bytes) -> bytes:
     return hashlib.blake2b(data, digest_size=_HASH_BYTES).digest()
-
-
-def _without_arrays(value: Any, arrays: list[NDArray[Any]]) -> Any:
-    """The value with a number in place of each array, which is appended to ``arrays``."""
-    if isinstance(value, np.ndarray):
-        arrays.append(value)
-        return {_ARRAY: len(arrays) - 1}
-    return {key: _without_arrays(item, arrays) for key, item in value.items()} if isinstance(value, dict) else value
-
-
-def _with_arrays(value: Any, archive: Any) -> Any:
-    if not isinstance(value, dict):
-        return value
-    if value.keys() == {_ARRAY}:
-        return archive[str(value[_ARRAY])]
-    return {key: _with_arrays(item, archive) for key, item in value.items()}
