@@ -17,6 +17,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable
+from itertools import repeat
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
@@ -37,8 +38,6 @@ MOST_LINES: Final = 5_000_000
 """Lines of a compressed text, beside one for each of its bytes; a line of a log has tens of bytes."""
 _MOST_FRAMES: Final = 100
 """Compressed frames in one content."""
-STEPS: Final = 100_000
-"""Steps of SQLite between two looks at their number."""
 _BUFFER_BYTES: Final = 1 << 17
 _FLAGS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 """Without O_NONBLOCK, opening a pipe waits for a writer."""
@@ -272,8 +271,10 @@ def open_database(path: Path) -> sqlite3.Connection:
     connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
     try:
         connection.execute("PRAGMA trusted_schema=OFF")
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest_value(size))
-        connection.set_progress_handler(step_counter(size), STEPS)
+        # a damaged database can name values that fill the memory, and queries that never end
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(max(size, 1 << 20), 1_000_000_000))
+        steps = repeat(False, 200 + size // 5000)  # of 100,000; an honest database needs less than one for each byte
+        connection.set_progress_handler(lambda: next(steps, True), 100_000)
         found = connection.execute(
             "SELECT type, name FROM sqlite_schema WHERE type NOT IN ('table', 'index') OR rootpage = 0"
             " UNION ALL SELECT 'computed column', part.name FROM sqlite_schema AS whole, "
@@ -285,23 +286,6 @@ def open_database(path: Path) -> sqlite3.Connection:
         connection.close()
         raise
     return connection
-
-
-def longest_value(size: int) -> int:
-    """The longest value in a database of ``size`` bytes: a damaged one can name longer ones, which fill the memory."""
-    return min(max(size, 1 << 20), 1_000_000_000)
-
-
-def step_counter(size: int) -> Callable[[], bool]:
-    """A progress handler for a database of ``size`` bytes, called every ``STEPS``: true when it takes too many."""
-    left = (20_000_000 + 20 * size) // STEPS  # an honest database needs less than one step per byte
-
-    def is_too_much() -> bool:
-        nonlocal left
-        left -= 1
-        return left < 0
-
-    return is_too_much
 
 
 def _open_within(path: Path, within: Path) -> int:
