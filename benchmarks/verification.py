@@ -77,7 +77,7 @@ def pool(count: int) -> Iterator[Sequence[Executor]]:
 @contextmanager
 def dask(count: int) -> Iterator[Sequence[Executor]]:
     """Workers of a cluster on this machine, each a process as the scheduler is."""
-    from fcslam.cluster.dask_cluster import DaskCluster
+    from fcslam.cluster.verifying import DaskCluster
 
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         file = Path(folder) / "scheduler.json"

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.cluster.dask_cluster import DaskCluster
-from fcslam.cluster.verifying import verifying
+from fcslam.cluster.verifying import DaskCluster, verifying
 from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import Pair, VerificationPool, verify_here
@@ -152,7 +151,7 @@ def refusal(cluster):
 
 
 def test_a_cluster_that_is_not_there_is_told_in_one_line_or_waited_for(monkeypatch, tmp_path, warnings_of, pairs):
-    from fcslam.cluster import dask_cluster
+    from fcslam.cluster import verifying as dask_cluster
 
     monkeypatch.setattr(dask_cluster, "CONNECT_S", 0.5)
     with (

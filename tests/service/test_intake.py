@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.edits import read_edit
 from fcslam.cloud.replies import SessionCorrection
-from fcslam.errors import PacketConflictError, PacketError
+from fcslam.errors import InputError, PacketConflictError, PacketError
 from fcslam.mission import mission_store
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Correction, Removal, Undo, Veto, frozen
 from fcslam.service import intake as module
-from fcslam.service.intake import AGENT_LEASE_S, BusyError, Intake, LeaseError, RefusedPacketError
+from fcslam.service.intake import AGENT_LEASE_S, BusyError, Intake, RefusedPacketError
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode
@@ -175,16 +175,16 @@ def test_bytes_that_are_no_batch_change_nothing(desk):
 def test_a_second_agent_waits_until_the_first_is_silent_long_enough(desk):
     desk.take(DATA[0], agent="x")
     desk.take(robot="b", agent="y")  # another robot is another matter
-    with pytest.raises(LeaseError, match="another agent"):
+    with pytest.raises(InputError, match="another agent"):
         desk.take(DATA[1], agent="y")
     desk.now += AGENT_LEASE_S - 1.0
     desk.take(DATA[1], agent="x")
     desk.now += AGENT_LEASE_S - 1.0
-    with pytest.raises(LeaseError):
+    with pytest.raises(InputError):
         desk.take(DATA[2], agent="y")
     desk.now += 1.0
     assert desk.take(DATA[2], agent="y") == [Acknowledgement("a", 0, 2)]
-    with pytest.raises(LeaseError):
+    with pytest.raises(InputError):
         desk.take(DATA[3], agent="x")
 
 
@@ -198,7 +198,7 @@ def test_what_cannot_be_taken_in_now_has_to_wait(desk, monkeypatch):
 
 
 def test_a_packet_far_ahead_has_to_wait_for_those_before_it(desk, monkeypatch):
-    monkeypatch.setattr(module, "FURTHEST_AHEAD", 3)
+    monkeypatch.setattr(module, "MOST_EARLY", 3)
     with pytest.raises(BusyError, match="send packet 0 first"):
         desk.take(DATA[4])
     assert desk.take(DATA[3]) == []

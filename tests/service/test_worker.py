@@ -24,10 +24,9 @@ from fcslam.records import ClosureStatus, FloorLabel, Place, Removal, Undo, Veto
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
 from fcslam.service import worker as worker_module
-from fcslam.service.crash_log import MOST_CRASHES
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import PROGRESS, STAGES
-from fcslam.service.worker import AT_ONCE, SNAPSHOT_EVERY_S, Worker
+from fcslam.service.worker import AT_ONCE, MOST_CRASHES, SNAPSHOT_EVERY_S, Worker
 from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, read_label

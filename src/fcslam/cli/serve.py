@@ -100,7 +100,10 @@ def serve(
             process = serving.learning_process(learning, state, data / "learning")
             routers.append(learning_router(state, stack.enter_context(process)))
         app = create_app(
-            state, routers, local_names=tokens is None and client_ca is None, named=None if store is None else NAMED
+            state,
+            routers,
+            only_local_names=tokens is None and client_ca is None,
+            named=None if store is None else NAMED,
         )
         server = serving.make_server(app, certificate, key, client_ca, state.close)
         scheme, (address, number) = "https" if certificate else "http", listening.getsockname()[:2]

@@ -14,7 +14,7 @@ from fcslam.page import ASSETS, MODULES
 from fcslam.page.report import ReadOnly, report_html, viewer_app
 from fcslam.service.http.app import PREFIX
 from fcslam.service.http.authentication import VIEWERS
-from fcslam.service.http.middleware import LocalNames
+from fcslam.service.http.middleware import local_names
 from fcslam.service.http.responses import unless_known
 from fcslam.service.http.state import ViewerState
 from fcslam.service.viewed_mission import ViewedMission
@@ -64,7 +64,7 @@ def run_page(mission: ViewedMission) -> FastAPI:
     app = viewer_app(state)
     app.include_router(page_router())
     app.include_router(report_router(state))
-    app.add_middleware(LocalNames)
+    app.add_middleware(local_names)
     return app
 
 

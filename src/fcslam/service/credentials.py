@@ -31,7 +31,6 @@ from fcslam.wire.keys import AUTHORITY, CERTIFICATE, TOKEN
 
 AUTHORITY_DAYS, LEAF_DAYS = 3650, 397
 """Longest validity of a server certificate that clients accept."""
-TOKEN_BYTES = 32
 
 _USAGES = (
     "digital_signature",
@@ -156,7 +155,7 @@ def _add_tokens(folder: Path, names: Mapping[str, Role]) -> None:
     known = {entry.name for entry in entries}
     for name, role in names.items():
         if name not in known:
-            token = secrets.token_urlsafe(TOKEN_BYTES)
+            token = secrets.token_urlsafe()
             place = folder_of(folder, name, role) / TOKEN
             if place.exists():
                 raise InputError(f"{place}: tokens.yaml has no entry for this token; remove it, and a new one is made")

@@ -10,7 +10,7 @@ from fcslam.cloud.edits import in_force, is_removed
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import ReplyState, replies
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
-from fcslam.errors import FcslamError, PacketError
+from fcslam.errors import FcslamError, InputError, PacketError
 from fcslam.mission.mission_store import MissionStore, StoredPacket
 from fcslam.records import Channel, DetectorFile, Place
 from fcslam.wire.batches import read_batch, write_batch
@@ -23,25 +23,17 @@ AGENT_LEASE_S = 30.0
 LONGEST_QUEUE = 50_000
 """Largest number of packets that arrived and did not take effect yet; the service takes no more until some did."""
 MOST_EARLY = 20_000
-"""Largest number of packets of one robot, in all its sessions, that wait for one before them."""
-FURTHEST_AHEAD = 20_000
-"""How far a packet's number may be ahead of the first missing packet of its session."""
-RETRY_AFTER_S = 2.0
-"""Seconds that a robot waits before it sends refused packets again."""
-BURST_S = 20.0
-"""A robot may send as many packets at once as it may send in this time."""
+"""Largest number of packets of one robot, in all its sessions, that wait for one before them; also how far a packet's
+number may be ahead of the first missing packet of its session.
+"""
 
 
 class BusyError(FcslamError):
     """The service cannot take the packets now; the robot sends them again later."""
 
-    def __init__(self, message: str, retry_after_s: float = RETRY_AFTER_S) -> None:
+    def __init__(self, message: str, retry_after_s: float = 2.0) -> None:
         super().__init__(message)
         self.retry_after_s = retry_after_s
-
-
-class LeaseError(FcslamError):
-    """Another agent holds this robot's lease."""
 
 
 class RefusedPacketError(FcslamError):
@@ -124,9 +116,9 @@ class Agents:
         return None if held is None else self._clock() - held[1]
 
 
-def held_by_another(robot: str, wait_s: float) -> LeaseError:
+def held_by_another(robot: str, wait_s: float) -> InputError:
     """Another agent speaks for a robot, for so long at most if it is gone."""
-    return LeaseError(
+    return InputError(
         f"{robot}: another agent speaks for this robot; stop one of the two or name it differently, "
         f"or wait {wait_s:.0f} s if it is gone"
     )
@@ -148,7 +140,7 @@ class Intake:
         for the robots, if other instances know that as well.
         """
         self._limits = limits = limits or ClaimLimits()
-        burst = max(BURST_S * limits.packets_per_s, MAXIMUM_BATCH_PACKETS)
+        burst = max(20.0 * limits.packets_per_s, MAXIMUM_BATCH_PACKETS)  # those of 20 s
         self._packet_rate = TokenBuckets(clock, limits.packets_per_s, burst)
         self._session_rate = TokenBuckets(clock, limits.sessions_per_hour / 3600.0, limits.sessions_per_hour)
         self._store, self._wall_clock, self._announced = store, wall_clock, announced
@@ -164,7 +156,7 @@ class Intake:
             PacketError: the batch cannot be taken apart; nothing is stored.
             RefusedPacketError: a packet of it is refused.
             PacketConflictError: another packet has the number of one of them; those before it are stored.
-            LeaseError: another agent speaks for the robot.
+            InputError: another agent speaks for the robot.
             BusyError: it has to be sent again later.
             StoreError: the disk is full; nothing is stored.
         """
@@ -240,7 +232,7 @@ class Intake:
         with self._lock:
             for _, epoch, sequence in numbers:
                 first = self._log.next_sequence(session_name(robot, epoch))
-                if sequence > first + FURTHEST_AHEAD:
+                if sequence > first + MOST_EARLY:
                     raise BusyError(f"{robot}: packet {sequence} is far ahead; send packet {first} first")
             early = self._log.would_wait(PacketNumber(session_name(robot, epoch), k) for _, epoch, k in numbers)
         if early and self.waiting_count(robot) + len(early) > MOST_EARLY:

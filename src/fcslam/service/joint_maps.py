@@ -122,15 +122,6 @@ def read_joint_maps(path: Path) -> JointMaps:
         raise StoreError(f"{path}: no joint maps can be read ({error})") from error
 
 
-class LivePose(NamedTuple):
-    """A pose that a robot says it has."""
-
-    map: int
-    pose: tuple[float, float, float]
-    said_s: float
-    """When, seconds since 1970."""
-
-
 class Exploration(NamedTuple):
     """The frontiers of one map and who explores which of them."""
 
@@ -150,7 +141,8 @@ class ServedJointMaps:
         self._maps = JointMaps((), {}, {})
         self._histories: dict[str, TileHistory] = {}
         """By frame."""
-        self._live: dict[str, LivePose] = {}
+        self._live: dict[str, tuple[int, tuple[float, float, float], float]] = {}
+        """By robot, the map and the pose that it says it has, and when it said so, seconds since 1970."""
         self._exploring = threading.Lock()
         self._explorers: dict[str, Explorer] = {}
         """By frame."""
@@ -178,11 +170,11 @@ class ServedJointMaps:
             history = self._histories.get(maps.frames.get(number, ""))
             return None if history is None else history.since(frame, version, limit_bytes)
 
-    def say(self, robot: str, live: LivePose) -> None:
-        """Take the pose that a robot of the newest joint maps says it has."""
+    def say(self, robot: str, number: int, pose: tuple[float, float, float], now_s: float) -> None:
+        """Take the map and the pose that a robot of the newest joint maps says it has now."""
         with self._lock:
             if any(session.robot == robot for session in self._maps.sessions):
-                self._live[robot] = live
+                self._live[robot] = number, pose, now_s
 
     def pose(self, session: JointSession) -> tuple[tuple[float, float, float], float]:
         """The newest credible pose of a robot and when it was there, seconds since 1970.
@@ -190,12 +182,12 @@ class ServedJointMaps:
         What a robot says of itself counts only if it can have driven there since its newest keyscan, which the map
         confirms.
         """
-        live = self._live.get(session.robot)
-        if live is None or live.map != session.map or not 0.0 < session.heard_s <= live.said_s:
-            return session.pose, session.heard_s
-        apart_m = math.dist(live.pose[:2], session.pose[:2])
-        is_credible = apart_m <= 1.0 + LONGEST_SPEED_MPS * (live.said_s - session.heard_s)
-        return (live.pose, live.said_s) if is_credible else (session.pose, session.heard_s)
+        number, pose, said_s = self._live.get(session.robot, (-1, session.pose, 0.0))
+        if number == session.map and 0.0 < session.heard_s <= said_s:
+            reach_m = 1.0 + LONGEST_SPEED_MPS * (said_s - session.heard_s)
+            if math.dist(pose[:2], session.pose[:2]) <= reach_m:
+                return pose, said_s
+        return session.pose, session.heard_s
 
     def explorations(self, maps: JointMaps, now_s: float) -> dict[int, Exploration]:
         """The frontiers of each map, about ``ASSIGN_EVERY_S`` old at most; of large maps older. None before the first.

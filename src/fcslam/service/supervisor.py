@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 from fcslam.cloud.stage_times import StageTotal
 from fcslam.processes import Child, module_command
 
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 30.0
-"""Pause before another start; it doubles with each crash."""
-STEADY_S = 60.0
-"""Seconds after which a worker's crash is not blamed on its start."""
+LONGEST_PAUSE_S = 30.0
+"""Longest pause before another start. The first one is a second, and each one twice as long as that before; so is the
+first one after a worker that ran for longer than this.
+"""
 READY = "ready"
 """The event by which a worker reports that it is ready."""
 PROGRESS = "progress"
@@ -104,7 +104,7 @@ class Supervisor:
         self._thread.join()
 
     def _run(self) -> None:
-        pause_s = FIRST_PAUSE_S
+        pause_s = 1.0
         while not self._stopping.is_set():
             began = time.monotonic()
             try:
@@ -113,8 +113,8 @@ class Supervisor:
                 ended = f"could not be run ({type(error).__name__}: {error})"
             if self._stopping.is_set():
                 return
-            if time.monotonic() - began > STEADY_S:
-                pause_s = FIRST_PAUSE_S
+            if time.monotonic() - began > LONGEST_PAUSE_S:
+                pause_s = 1.0
             pause_s = min(pause_s, self._longest_pause_s)
             _log.error("the worker %s; another one starts in %.0f s", ended, pause_s)
             self._stopping.wait(pause_s)

@@ -2,7 +2,7 @@
 
 import threading
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from fcslam.mission.mission_store import MissionStore
 from fcslam.runs import Run, open_run
@@ -54,11 +54,8 @@ def run_of(mission: ViewedMission) -> Run:
     return Run({}) if folder is None else viewed_run(folder)
 
 
-_MOST_KEPT: Final = 4
-"""Missions whose runs are kept in memory."""
-_keeping = threading.Lock()
-_reading: dict[Path, threading.Lock] = {}
-"""Many robots and pages ask at once: one request reads the run of a mission, the others wait for it."""
+_reading = threading.Lock()
+"""Many robots and pages ask at once: one request reads a run, the others wait for it."""
 _kept: dict[Path, tuple[object, Run]] = {}
 """The newest run of each mission, by the folder of its run folders. The one that was asked for last is the last."""
 
@@ -66,16 +63,12 @@ _kept: dict[Path, tuple[object, Run]] = {}
 def viewed_run(folder: Path) -> Run:
     """The run in a ``run_folder`` of a viewed mission, without its large files."""
     mission = folder.parent
-    with _keeping:
-        reading = _reading.setdefault(mission, threading.Lock())
-    with reading:
+    with _reading:
         key = folder, identity(folder) if folder.exists() else None
-        with _keeping:
-            known, run = _kept.pop(mission, (None, None))
+        known, run = _kept.pop(mission, (None, None))
         if run is None or known != key:
             run = open_run(folder, maps=False)
-        with _keeping:
-            _kept[mission] = key, run
-            if len(_kept) > _MOST_KEPT:
-                del _kept[next(iter(_kept))]
+        _kept[mission] = key, run
+        if len(_kept) > 4:
+            del _kept[next(iter(_kept))]
         return run

@@ -21,7 +21,7 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import blake2b
@@ -45,7 +45,6 @@ from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.mission_store import CONFIG, Envelope, Finalization, MissionStore, StoredPacket
 from fcslam.processes import RecurringTask, Start, emit_event, start_copy, trim_memory
 from fcslam.runs import QUALITY, Metric, Run
-from fcslam.service.crash_log import MOST_CRASHES, CrashLog
 from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SNAPSHOT, fetch_snapshot, put_file
@@ -62,28 +61,16 @@ AT_ONCE = 64
 AT_ONCE_S = 0.25
 """Packets, and about the time, between two looks at what else there is to do. Corrections leave in between, so a robot
 does not wait for its own while there is a queue."""
-LIVE_SHARE = 0.1
-"""Share of the time for writing the live run folder beside the worker."""
-JOINT_SHARE = 0.5
-"""Share of the time for drawing the joint maps beside the worker."""
-JOINT_EVERY_S = 0.5
-"""The joint maps are not drawn more often than this."""
-LIVE_LOOK_S = 0.05
-"""Between two looks whether the live run folder is written."""
 REPORT_EVERY_S = 0.1
 """Corrections are not stored more often than this: packets that come in wait until they are on the disk."""
 PAUSE_S = 30.0
 """After something could not be written."""
-SNAPSHOT_SHARE = 0.05
-"""Share of the worker's time for snapshots; bounds the replay of the next worker to 1 / share."""
 SNAPSHOT_EVERY_S = 5.0
 """The snapshot is not written more often than this."""
-SHARED_LOOK_S = 0.25
-"""Between two looks for packets that other instances stored: nobody rings for them."""
-LIVE_EVERY_S = 1.0
-"""The live run folder is not written more often than this."""
 QUALITY_EVERY_S = 30.0
-"""Its certificate is not computed more often than this, unless maps join or part."""
+"""The certificate of the live run is not computed more often than this, unless maps join or part."""
+MOST_CRASHES = 3
+"""Consecutive workers that may end at one task; the next worker leaves the task out."""
 
 LATE = "fcslam.lidar.uniqueness", "fcslam.maps.certificate"
 """Modules with SciPy, which a robot loads late or never; no packet and no copy of the worker should wait for them."""
@@ -126,8 +113,8 @@ class Worker:
         """How many packets took effect before a restart: their results are stored already."""
         self._times: dict[tuple[str, int], float] = {}
         """Newest time of each session."""
-        joint_task = RecurringTask(start, clock, JOINT_SHARE, JOINT_EVERY_S)
-        live_task = RecurringTask(start, clock, LIVE_SHARE, LIVE_EVERY_S)
+        joint_task = RecurringTask(start, clock, share=0.5, every_s=0.5)
+        live_task = RecurringTask(start, clock, share=0.1, every_s=1.0)
         self._joint_maps = _Output("the joint maps", JOINT, folder.joint_maps, joint_task, self._joint_maps_writer)
         self._live = _Output("the live map", LIVE, folder.live, live_task, self._live_writer)
         self._outputs = self._joint_maps, self._live
@@ -156,10 +143,10 @@ class Worker:
 
     def wait_s(self) -> float:
         """How long there is nothing to do unless something comes in."""
-        now, waits_s = self._clock(), [LIVE_EVERY_S]
+        now, waits_s = self._clock(), [1.0]
         for output in self._outputs:
             if output.task.is_running:
-                waits_s.append(LIVE_LOOK_S)
+                waits_s.append(0.05)
             elif output.shown < self._applied:
                 waits_s.append(output.task.due_s - now)
         if self._reported < self._applied:
@@ -258,7 +245,7 @@ class Worker:
             _log.error("no snapshot of the worker was written: %s", error)
         trim_memory()  # gaps would grow for days
         self._written = self._applied
-        self._write_at = self._clock() + max((self._clock() - began) / SNAPSHOT_SHARE, SNAPSHOT_EVERY_S)
+        self._write_at = self._clock() + max(20.0 * (self._clock() - began), SNAPSHOT_EVERY_S)  # 5 % of the time
         return True
 
     def _resume(self) -> None:
@@ -443,6 +430,36 @@ class Worker:
         )
 
 
+class CrashLog:
+    """Remembers what a worker was doing when it ended, so that one task cannot end every worker after it.
+
+    The file outlives the worker, not a loss of power: a task costs no wait for the disk.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read what the worker before was at."""
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            before = json.loads(os.pread(self._file, 512, 0))
+            self._suspect, self._crashes = str(before["at"]), int(before["crashes"])
+        except (ValueError, LookupError, TypeError):
+            self._suspect, self._crashes = "", 0
+
+    def is_fatal(self, task: str) -> bool:
+        """Whether the task is left out, after ending too many workers in a row."""
+        return task == self._suspect and self._crashes >= MOST_CRASHES
+
+    def begin(self, task: str) -> None:
+        """Note that the worker begins a task, and has survived the one before."""
+        state = {"at": task, "crashes": self._crashes + 1 if task == self._suspect else 1}
+        with suppress(OSError):  # the disk is full
+            os.pwrite(self._file, json.dumps(state).encode().ljust(512), 0)
+
+    def end(self) -> None:
+        """Note that the worker has survived its task."""
+        self.begin("")
+
+
 @dataclass
 class _Output:
     """Results that copies of the worker write now and then: the live run folder, or the joint maps."""
@@ -492,7 +509,7 @@ def main() -> int:
     if task is None:
         return 0
     folder = MissionFolder(Path(task.folder))
-    look_s = math.inf if task.store is None else SHARED_LOOK_S
+    look_s = math.inf if task.store is None else 0.25  # nobody notifies of packets that other instances stored
     alone, mission = _alone(folder), _mission(folder, task)
     with verifying(task.workers, must_connect=False) as verify_pairs, mission as (store, share):
         try:

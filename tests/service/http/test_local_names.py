@@ -5,7 +5,7 @@ import asyncio
 import httpx
 import pytest
 
-from fcslam.service.http.middleware import LocalNames, is_local_name
+from fcslam.service.http.middleware import is_local_name, local_names
 
 
 @pytest.mark.parametrize(
@@ -29,7 +29,7 @@ def answer(method, host, headers=()):
         await send({"type": "http.response.body"})
 
     async def ask():
-        transport = httpx.ASGITransport(app=LocalNames(app))
+        transport = httpx.ASGITransport(app=local_names(app))
         async with httpx.AsyncClient(transport=transport, base_url=f"http://{host}") as client:
             return await client.request(method, "/", headers=dict(headers))
 

@@ -619,9 +619,7 @@ def test_the_age_is_that_of_the_oldest_packet_without_effect(desk):
     assert age() == 0.0
 
 
-@pytest.mark.parametrize("at_once", [1, 7, 10_000])
-def test_what_robots_sent_is_counted_on_when_the_service_starts_again(tmp_path, scripted, monkeypatch, at_once):
-    monkeypatch.setattr(measures, "_AT_ONCE", at_once)
+def test_what_robots_sent_is_counted_on_when_the_service_starts_again(tmp_path, scripted):
     scripted()
     with Desk(tmp_path / "data") as desk:
         desk.told(desk.send("a", A[:5]))

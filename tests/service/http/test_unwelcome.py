@@ -88,7 +88,7 @@ def test_too_many_waiting_requests_without_a_token_are_refused(monkeypatch):
 
 @pytest.mark.slow
 def test_a_tls_handshake_that_does_not_come_is_hung_up_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(protocol, "HANDSHAKE_S", 1.0)
+    monkeypatch.setattr(protocol, "IDLE_S", 1.0)
     make_credentials(tmp_path, ["127.0.0.1"], {}, datetime.now(UTC))
 
     async def app(scope, receive, send):

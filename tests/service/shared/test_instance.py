@@ -13,7 +13,7 @@ from fcslam.errors import InputError, StoreError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.mission.mission_store import MissionStore
 from fcslam.service.audit_log import audit_table
-from fcslam.service.intake import AGENT_LEASE_S, LeaseError
+from fcslam.service.intake import AGENT_LEASE_S
 from fcslam.service.shared.files import SharedDetectors
 from fcslam.service.shared.instance import GRACE_S, Instance, fair_part
 from fcslam.service.shared.mission_tables import Lease, MissionTables
@@ -240,7 +240,7 @@ def test_another_agent_is_refused_by_every_instance(registry, postgres):
     here, there = (SharedAgents(postgres, number, lambda: now[0]) for _ in range(2))
     here.hold("a", "x")
     there.hold("b", "y")
-    with pytest.raises(LeaseError, match="another agent speaks for this robot"):
+    with pytest.raises(InputError, match="another agent speaks for this robot"):
         there.hold("a", "z")
     there.hold("a", "x")  # a robot may change the instance
     now[0] += AGENT_LEASE_S

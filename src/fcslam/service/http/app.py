@@ -16,7 +16,7 @@ from fcslam.service.http.events import event_router
 from fcslam.service.http.fleet import fleet_router
 from fcslam.service.http.joint_maps import joint_map_router
 from fcslam.service.http.maps import map_router
-from fcslam.service.http.middleware import LocalNames, NamedMissions, UnauthenticatedLimit, Watch
+from fcslam.service.http.middleware import UnauthenticatedLimit, local_names, named_missions, watched
 from fcslam.service.http.missions import mission_router
 from fcslam.service.http.operations import operations_router
 from fcslam.service.http.problems import add_handlers
@@ -29,31 +29,26 @@ VIEWER_ROUTERS = (fleet_router, map_router, event_router)
 ROUTERS = (robot_router, joint_map_router, detector_router, mission_router, decision_router)
 
 
-class Service(FastAPI):
-    """Describes what it does: FastAPI adds to every route a refusal that this service words otherwise."""
-
-    def openapi(self) -> dict[str, Any]:
-        """The interface, in OpenAPI 3.1."""
-        if self.openapi_schema:
-            return self.openapi_schema
-        described = super().openapi()
-        for operation in (one for path in described["paths"].values() for one in path.values()):
-            operation["responses"].pop("422", None)
-        for unused in ("HTTPValidationError", "ValidationError"):
-            described["components"]["schemas"].pop(unused, None)
-        return described
+def described(app: FastAPI) -> dict[str, Any]:
+    """The interface, in OpenAPI 3.1, without the refusal that FastAPI adds to every route: this service words it."""
+    description = app.openapi()
+    for operation in (one for path in description["paths"].values() for one in path.values()):
+        operation["responses"].pop("422", None)
+    for unused in ("HTTPValidationError", "ValidationError"):
+        description["components"]["schemas"].pop(unused, None)
+    return description
 
 
 def create_app(
     state: ServiceState,
     more: Sequence[APIRouter] = (),
-    local_names: bool = False,
+    only_local_names: bool = False,
     named: ContextVar[str | None] | None = None,
 ) -> FastAPI:
     """The service; ``more`` routers come from rooms that this one does not know. Closes the missions at its end.
 
-    With ``local_names``, it refuses requests that do not name the machine by an address or as localhost. With
-    ``named``, requests may name a mission (``NamedMissions``).
+    With ``only_local_names``, it refuses requests that do not name the machine by an address or as localhost. With
+    ``named``, requests may name a mission (``named_missions``).
     """
 
     @asynccontextmanager
@@ -63,7 +58,7 @@ def create_app(
         state.audit.flush()
         state.missions.close()
 
-    app = Service(
+    app = FastAPI(
         title="fcslam",
         version=fcslam.__version__,
         docs_url=None,
@@ -76,16 +71,16 @@ def create_app(
     for make in (*ROUTERS, *VIEWER_ROUTERS):
         app.include_router(make(state), prefix=PREFIX)
     app.include_router(operations_router(state))
-    description = cache(lambda: json.dumps(app.openapi(), ensure_ascii=False, separators=(",", ":")).encode())
+    description = cache(lambda: json.dumps(described(app), ensure_ascii=False, separators=(",", ":")).encode())
     app.add_route(
         "/openapi.json", lambda _: Response(description(), media_type="application/json"), include_in_schema=False
     )
     for router in more:
         app.include_router(router)
-    if local_names:
-        app.add_middleware(LocalNames)
-    app.add_middleware(Watch, state=state)
+    if only_local_names:
+        app.add_middleware(local_names)
+    app.add_middleware(watched, state=state)
     app.add_middleware(UnauthenticatedLimit, is_known=state.is_known)
     if named is not None:
-        app.add_middleware(NamedMissions, named=named)
+        app.add_middleware(named_missions, named=named)
     return app

@@ -25,7 +25,7 @@ from fcslam.service.http.limits import json_body, read_json
 from fcslam.service.http.responses import file_of, refusals
 from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
-from fcslam.service.joint_maps import Exploration, LivePose, ServedJointMaps
+from fcslam.service.joint_maps import Exploration, ServedJointMaps
 from fcslam.service.map_layers import MOST_LAYER_BYTES
 from fcslam.service.viewed_mission import run_of, viewed_run
 from fcslam.untrusted import read_text
@@ -72,7 +72,7 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         now_s = time.time()
         maps = joint.follow(state.mission.joint_maps)
         if own.map is not None and own.pose is not None:
-            joint.say(robot, LivePose(own.map, own.pose, now_s))
+            joint.say(robot, own.map, own.pose, now_s)
         robots = []
         for session in maps.sessions:
             pose, said_s = joint.pose(session)

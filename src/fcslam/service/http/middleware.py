@@ -2,6 +2,7 @@
 
 import asyncio
 import re
+import time
 from collections import deque
 from collections.abc import Callable
 from contextvars import ContextVar
@@ -18,9 +19,8 @@ from fcslam.records import NAME
 from fcslam.service.http.limits import CONTENT
 from fcslam.service.http.problems import problem
 from fcslam.service.http.state import ACTOR, ServiceState
+from fcslam.service.intake import TokenBuckets
 
-LONGEST_ACTION = 300
-"""Characters of a request in the audit log; anybody with a token chooses the rest."""
 PER_S, AT_ONCE = 100.0, 20.0
 """Requests that are answered, on average and at once: each takes about a millisecond of the process."""
 MOST_WAITING = 4096
@@ -41,12 +41,11 @@ class UnauthenticatedLimit:
         self._waiting: dict[str, deque[asyncio.Future[bool]]] = {}
         """By address, that of the next turn first."""
         self._count = 0
-        self._credit, self._at = AT_ONCE, 0.0
-        """Requests that may pass now, as of a time of the loop."""
+        self._passed = TokenBuckets(time.monotonic, PER_S, AT_ONCE)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on when it is its turn, or refuse it."""
-        if scope["type"] == "http" and not self._is_known(scope) and not self._passes():
+        if scope["type"] == "http" and not self._is_known(scope) and (self._waiting or self._passed.wait_s("", 1.0)):
             if self._count >= MOST_WAITING:
                 self._drop()
             if not await self._turn(scope):
@@ -54,15 +53,6 @@ class UnauthenticatedLimit:
                 await problem(429, text, {"retry-after": "60", "connection": "close"})(scope, receive, send)
                 return
         await self._app(scope, receive, send)
-
-    def _passes(self) -> bool:
-        now = asyncio.get_running_loop().time()
-        self._credit = min(AT_ONCE, self._credit + (now - self._at) * PER_S)
-        self._at = now
-        if self._waiting or self._credit < 1.0:
-            return False
-        self._credit -= 1.0
-        return True
 
     async def _turn(self, scope: Scope) -> bool:
         """Wait for the turn; false if the request has to make room."""
@@ -104,37 +94,29 @@ class UnauthenticatedLimit:
             asyncio.get_running_loop().call_later(1.0 / PER_S, self._next)
 
 
-READING = ("GET", "HEAD", "OPTIONS")
-"""Methods that change nothing."""
-
-
-class LocalNames:
-    """Refuses requests by a name that is not this machine's, and changes that pages of other sites send.
+def local_names(app: ASGIApp) -> ASGIApp:
+    """Refuse requests by a name that is not this machine's, and changes that pages of other sites send.
 
     A page may have its own name pointed to this machine (DNS rebinding), or send a form to it (cross-site request
-    forgery).
-
-    A service that knows nobody's token needs it: a browser sends the name of the page that asks.
+    forgery). A service that knows nobody's token needs it: a browser sends the name of the page that asks.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or refuse it."""
-        app = self._app
+    async def check(scope: Scope, receive: Receive, send: Send) -> None:
+        answer = app
         if scope["type"] == "http":
             headers = Headers(scope=scope)
             if not is_local_name(headers.get("host", "")):
                 text = (
                     "a service without tokens answers to its address, its host name and localhost; ask by one of these"
                 )
-                app = problem(421, text)
-            elif scope["method"] not in READING and is_cross_site(headers):
-                app = problem(
+                answer = problem(421, text)
+            elif scope["method"] not in ("GET", "HEAD", "OPTIONS") and is_cross_site(headers):
+                answer = problem(
                     403, "a page of another site sends this; a service without tokens takes no changes from it"
                 )
-        await app(scope, receive, send)
+        await answer(scope, receive, send)
+
+    return check
 
 
 def is_cross_site(headers: Headers) -> bool:
@@ -163,52 +145,47 @@ def is_local_name(host: str) -> bool:
 _ADDRESS: Final = re.compile(rf"/missions/({NAME.pattern})(/(?!healthz$|readyz$).*)", re.ASCII)
 
 
-class NamedMissions:
-    """Takes ``/missions/NAME`` off the path, and notes the name in a context variable: the request is about it."""
+def named_missions(app: ASGIApp, named: ContextVar[str | None]) -> ASGIApp:
+    """Take ``/missions/NAME`` off the path, and note the name in a context variable: the request is about it."""
 
-    def __init__(self, app: ASGIApp, named: ContextVar[str | None]) -> None:
-        self._app, self._named = app, named
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """As an ASGI application."""
+    async def take(scope: Scope, receive: Receive, send: Send) -> None:
         found = _ADDRESS.fullmatch(scope["path"]) if scope["type"] == "http" else None
         if found is None:
-            await self._app(scope, receive, send)
+            await app(scope, receive, send)
             return
-        before = self._named.set(found[1])
+        before = named.set(found[1])
         try:
-            await self._app({**scope, "path": found[2], "raw_path": found[2].encode()}, receive, send)
+            await app({**scope, "path": found[2], "raw_path": found[2].encode()}, receive, send)
         finally:
-            self._named.reset(before)
+            named.reset(before)
+
+    return take
 
 
-class Watch:
-    """Counts answers that refuse, and writes the audit log.
+def watched(app: ASGIApp, state: ServiceState) -> ASGIApp:
+    """Count answers that refuse, and write the audit log.
 
     Plain ASGI: a middleware of Starlette's own base runs a task for every request.
     """
 
-    def __init__(self, app: ASGIApp, state: ServiceState) -> None:
-        self._app, self._state = app, state
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, and note the answer."""
-
-        async def watched(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                self._note(scope, message["status"])
-            await send(message)
-
-        await self._app(scope, receive, watched)
-
-    def _note(self, scope: Scope, status: int) -> None:
+    def note(scope: Scope, status: int) -> None:
         address = (scope.get("client") or ("",))[0]
         if status >= 400:
-            self._state.measures.refuse(status)
+            state.measures.refuse(status)
         if status == 401:
-            self._state.audit.refuse_login(address)
+            state.audit.refuse_login(address)
         known = scope.get("state", {})
         if ACTOR in known:
             asked = f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else ""
-            action = f"{scope['method']} {scope['path']}{asked}"[:LONGEST_ACTION]
-            self._state.audit.record(known[ACTOR], address, action, status, known.get(CONTENT, {}))
+            action = f"{scope['method']} {scope['path']}{asked}"[:300]  # anybody with a token chooses the rest
+            state.audit.record(known[ACTOR], address, action, status, known.get(CONTENT, {}))
+
+    async def watch(scope: Scope, receive: Receive, send: Send) -> None:
+        async def noting(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                note(scope, message["status"])
+            await send(message)
+
+        await app(scope, receive, noting)
+
+    return watch

@@ -10,7 +10,7 @@ from fcslam.errors import StoreError
 from fcslam.service.audit_log import AuditEntry
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.problems import problem
-from fcslam.service.http.responses import Readiness, file_of, refusals
+from fcslam.service.http.responses import file_of, refusals
 from fcslam.service.http.state import ServiceState
 
 LARGEST_BACKLOG = 200
@@ -36,8 +36,8 @@ def operations_router(state: ServiceState) -> APIRouter:
             raise HTTPException(503, f"the service takes packets, but the worker is {is_down}")
         return {"status": "ok"}
 
-    @router.get("/readyz", response_model=Readiness, responses=refusals(503))
-    def get_readiness() -> Readiness | JSONResponse:
+    @router.get("/readyz", response_model=dict[str, str | int], responses=refusals(503))
+    def get_readiness() -> dict[str, str | int] | JSONResponse:
         """200 while the worker follows what robots send, 503 while it starts or catches up."""
         backlog = state.mission.intake.ready_count() - state.mission.worker.applied
         if state.closing or not state.mission.worker.is_ready:
@@ -46,7 +46,7 @@ def operations_router(state: ServiceState) -> APIRouter:
             )
         if backlog > LARGEST_BACKLOG:
             return problem(503, f"the worker is catching up: {backlog} packets have no effect yet", backlog=backlog)
-        return Readiness(backlog=backlog)
+        return {"status": "ready", "backlog": backlog}
 
     @router.get("/api/v1/audit", dependencies=state.require(Role.ADMIN), responses=refusals(400, 401, 403, 503))
     def get_audit(limit: Annotated[int, Query(ge=1, le=10_000)] = 100) -> list[AuditEntry]:

@@ -19,12 +19,11 @@ from fcslam.errors import (
     PacketError,
     StoreError,
 )
-from fcslam.service.intake import BusyError, LeaseError, RefusedPacketError
+from fcslam.service.intake import BusyError, RefusedPacketError
 from fcslam.service.missions import UnknownMissionError
 
 STATUS: dict[type[FcslamError], int] = {
     BusyError: 429,
-    LeaseError: 409,
     RefusedPacketError: 400,
     PacketConflictError: 409,
     PacketError: 400,

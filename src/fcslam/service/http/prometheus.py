@@ -16,9 +16,6 @@ from fcslam.wire.batches import read_batch
 from fcslam.wire.ledger import Traffic
 from fcslam.wire.packets import read_label
 
-_AT_ONCE = 10_000
-"""Packets counted in one query of the store."""
-
 
 class ServiceMetrics:
     """Counts replies and refusals; reads everything else from the mission on request."""
@@ -33,7 +30,11 @@ class ServiceMetrics:
             registry=self._registry,
         )
         self._refused = Counter("fcslam_refusals", "Requests refused, by status", ("status",), registry=self._registry)
-        self._uplink = _Uplink()
+        self._lock = threading.Lock()
+        self._counted: dict[str, int] = {}
+        """Last arrival that is counted, by mission."""
+        self._traffic: defaultdict[tuple[str, str, str, str], Traffic] = defaultdict(Traffic)
+        """By mission, robot, kind and channel; without a kind are packets that could not be read."""
 
     def answer(self, robot: str, batch: bytes) -> None:
         """Count the bytes of a reply."""
@@ -50,7 +51,7 @@ class ServiceMetrics:
 
     def text(self, mission: OpenMission) -> bytes:
         """All metrics in the Prometheus text format."""
-        families = *self._registry.collect(), *self._gauges(mission), *self._uplink.families(mission), *_stages(mission)
+        families = *self._registry.collect(), *self._gauges(mission), *self._uplink(mission), *_stages(mission)
         return generate_latest(cast(Collector, SimpleNamespace(collect=lambda: families)))
 
     def _gauges(self, mission: OpenMission) -> Iterator[Metric]:
@@ -66,6 +67,23 @@ class ServiceMetrics:
         ):
             yield GaugeMetricFamily(f"fcslam_{name}", text, value)
 
+    def _uplink(self, mission: OpenMission) -> Iterator[Metric]:
+        """The traffic of all missions by their stores, so it continues after a restart of the service."""
+        labels = ("mission", "robot", "kind", "channel")
+        packets = CounterMetricFamily("fcslam_packets", "Packets taken in", labels=labels)
+        sizes = CounterMetricFamily("fcslam_bytes", "Bytes of packets taken in", labels=labels)
+        name = mission.folder.name
+        with self._lock:
+            while groups := mission.store.traffic_since(self._counted.get(name, 0), 10_000):
+                for arrival, robot, kind, channel, traffic in groups:
+                    self._traffic[name, robot, kind or "", channel or ""] += traffic
+                    self._counted[name] = max(self._counted.get(name, 0), arrival)
+            for label, traffic in sorted(self._traffic.items()):
+                packets.add_metric(label, traffic.count)
+                sizes.add_metric(label, traffic.bytes)
+        yield packets
+        yield sizes
+
 
 def _stages(mission: OpenMission) -> Iterator[Metric]:
     """Runs of the present worker's stages and the time they took; they begin again with a new worker."""
@@ -76,31 +94,3 @@ def _stages(mission: OpenMission) -> Iterator[Metric]:
         seconds.add_metric((stage,), total.seconds)
     yield runs
     yield seconds
-
-
-class _Uplink:
-    """Uplink by the missions' stores; it continues after a restart of the service."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._counted: dict[str, int] = {}
-        """Last arrival that is counted, by mission."""
-        self._traffic: defaultdict[tuple[str, str, str, str], Traffic] = defaultdict(Traffic)
-        """By mission, robot, kind and channel; without a kind are packets that could not be read."""
-
-    def families(self, mission: OpenMission) -> Iterator[Metric]:
-        """The traffic of all missions, with the packets of this one that arrived since the last call."""
-        labels = ("mission", "robot", "kind", "channel")
-        packets = CounterMetricFamily("fcslam_packets", "Packets taken in", labels=labels)
-        sizes = CounterMetricFamily("fcslam_bytes", "Bytes of packets taken in", labels=labels)
-        name = mission.folder.name
-        with self._lock:
-            while groups := mission.store.traffic_since(self._counted.get(name, 0), _AT_ONCE):
-                for arrival, robot, kind, channel, traffic in groups:
-                    self._traffic[name, robot, kind or "", channel or ""] += traffic
-                    self._counted[name] = max(self._counted.get(name, 0), arrival)
-            for label, traffic in sorted(self._traffic.items()):
-                packets.add_metric(label, traffic.count)
-                sizes.add_metric(label, traffic.bytes)
-        yield packets
-        yield sizes

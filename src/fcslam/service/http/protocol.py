@@ -1,7 +1,6 @@
 """The connections of the service: how many there may be, how long they may be idle, and whose certificate they show."""
 
 import asyncio
-import itertools
 import resource
 import socket
 import ssl
@@ -16,41 +15,38 @@ import uvicorn
 from cryptography import x509
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from fcslam.service.http.middleware import WAITING
+from fcslam.service.http.middleware import MOST_WAITING, WAITING
 
-MOST_CONNECTIONS = 4096
-"""Connections without a request in progress; of more, one of the address that has most is closed."""
 WRITE_S = 20.0
 """Time for a client to read what fills the buffers of its connection, 64 KiB and those of the system."""
 REFUSAL_S = 5.0
 """Time until what is no HTTP is answered."""
 IDLE_S = 10.0
-"""Time for the header of a request, from the connection or the response before."""
+"""Time for a TLS handshake, and for the header of a request, from the connection or the response before."""
 BODY_S = 60.0
 """Time for a request with its body, beside that of its bytes."""
 LEAST_BYTES_PER_S = 20_000
 """A slower body is cut: a mission that is imported may take long, a client that sends a byte now and then may not."""
-HANDSHAKE_S = 10.0
-"""Time for a TLS handshake."""
-ACCEPTED_AT_ONCE, PAUSE_S = 20, 0.01
-"""Connections that are accepted without a pause, and the pause: two thousand in a second."""
+PAUSE_S = 0.001
+"""Pause after each connection that is accepted, and after a failure to accept one."""
 _LOOK_EVERY_S = 2.0
-_FILES = 16_384
-"""Files that may be open at a time, if the system allows it: connections whose TLS handshake is not done count, too."""
 
 
 def allow_many_connections() -> None:
-    """Raise this process's limit of open files."""
+    """Raise this process's limit of open files: connections whose TLS handshake is not done need some, too."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    most = _FILES if hard == resource.RLIM_INFINITY else min(_FILES, hard)
+    most = 4 * MOST_WAITING if hard == resource.RLIM_INFINITY else min(4 * MOST_WAITING, hard)
     if soft != resource.RLIM_INFINITY and soft < most:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 @cache
 def most_connections() -> int:
-    """Connections that there may be at a time: some files are left for missions and handshakes."""
-    return min(MOST_CONNECTIONS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
+    """Connections without a request in progress at a time: some files are left for missions and handshakes.
+
+    Of more, one of the address that has most is closed.
+    """
+    return min(MOST_WAITING, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
 
 
 _Factory = Callable[[], asyncio.Protocol]
@@ -88,7 +84,7 @@ class GuardedServer(uvicorn.Server):
 
 
 class _Listener:
-    """Accepts connections, a few at a time: asyncio accepts all that wait at once, and requests in progress wait."""
+    """Accepts connections one by one: asyncio accepts all that wait at once, and requests in progress wait."""
 
     def __init__(self, factory: _Factory, listening: socket.socket, tls: ssl.SSLContext | None) -> None:
         self._factory, self._listening, self._tls = factory, listening, tls
@@ -106,22 +102,20 @@ class _Listener:
 
     async def _accept(self) -> None:
         loop = asyncio.get_running_loop()
-        for number in itertools.count(1):
+        while True:
+            await asyncio.sleep(PAUSE_S)
             try:
                 connection, _ = await loop.sock_accept(self._listening)
             except OSError:  # no file is left: wait until a connection is closed
-                await asyncio.sleep(PAUSE_S)
                 continue
             handshake = loop.create_task(self._connect(connection))
             self._handshakes[handshake] = None
             handshake.add_done_callback(lambda task: self._handshakes.pop(task, None))
             if len(self._handshakes) > most_connections():
                 next(iter(self._handshakes)).cancel()
-            if number % ACCEPTED_AT_ONCE == 0:
-                await asyncio.sleep(PAUSE_S)
 
     async def _connect(self, connection: socket.socket) -> None:
-        timeout_s = None if self._tls is None else HANDSHAKE_S
+        timeout_s = None if self._tls is None else IDLE_S
         with suppress(OSError):  # the client is gone, or no client of ours
             await asyncio.get_running_loop().connect_accepted_socket(
                 self._factory, connection, ssl=self._tls, ssl_handshake_timeout=timeout_s

@@ -24,13 +24,6 @@ class Problem(StrictModel):
     backlog: int = Field(default=0, description="if a worker is not ready: packets that arrived without effect yet")
 
 
-class Readiness(StrictModel):
-    """The worker follows what robots send."""
-
-    status: Literal["ready"] = "ready"
-    backlog: int = Field(description="packets that arrived and have no effect yet")
-
-
 class PacketRefusal(StrictModel):
     """A refused packet; its number is used up."""
 
