@@ -41,7 +41,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
-from fcslam.graph.consistency import ConsistencySettings
+from fcslam.graph.evidence import ConsistencySettings
 from fcslam.graph.factors import FactorCache, from_values, to_values
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.joint import JointEvidence, solve_jointly

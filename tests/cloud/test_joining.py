@@ -10,7 +10,7 @@ from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.joining import decide_join
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.geometry import se2
-from fcslam.graph.consistency import ConsistencySettings
+from fcslam.graph.evidence import ConsistencySettings
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import Channel, ClosureStatus, KeyscanId, LoopClosure, Reason, ReasonCode, frozen
 from fcslam.storage.state_file import read_state, write_state

@@ -9,13 +9,13 @@ from fcslam.graph.evidence import (
     LEAST_LIKENESS,
     LEAST_RATIO,
     ClusterEvidence,
-    EvidenceSettings,
+    ConsistencySettings,
     MapFit,
     shortfall,
 )
 from fcslam.records import Reason, ReasonCode
 
-SETTINGS = EvidenceSettings()
+SETTINGS = ConsistencySettings()
 SPOT = ClusterEvidence(closures=146, informative=40, separate_places=1, rival_closures=0, rival_places=0)
 
 
@@ -51,7 +51,7 @@ def test_each_lack_has_its_reason_numbers_and_setting():
     }
     for evidence, reason in lacks.items():
         assert shortfall(evidence, SETTINGS) == reason
-        assert not reason.setting or reason.setting in EvidenceSettings.model_fields
+        assert not reason.setting or reason.setting in ConsistencySettings.model_fields
 
 
 @pytest.mark.parametrize("places", [1, 3, 30])

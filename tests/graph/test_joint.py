@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.graph import joint
-from fcslam.graph.consistency import ConsistencySettings
+from fcslam.graph.evidence import ConsistencySettings
 from fcslam.graph.joint import JointEvidence, JointSolution, solve_jointly
 from fcslam.graph.optimizer import Solution, optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph

@@ -51,9 +51,6 @@ def read_anchors(plan: StrPath | None = None, plan_scale: float | None = None, t
         plan: floor plan: a PNG drawing, a DXF drawing, or the YAML file of a ROS map.
         plan_scale: metres per pixel of a drawing; metres per unit of a DXF file that does not name its unit.
         tags: YAML file with the positions of surveyed tags.
-
-    Raises:
-        InputError: a file cannot be read or used, or the scale has no plan.
     """
     if plan is None and plan_scale is not None:
         raise InputError(

@@ -8,8 +8,8 @@ from fcslam.cloud.closure_log import ClosureEntry
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.graph import cluster
 from fcslam.graph.cluster import ClusterDecision
-from fcslam.graph.consistency import Closures, ConsistencySettings
-from fcslam.graph.evidence import MapFit
+from fcslam.graph.consistency import Closures
+from fcslam.graph.evidence import ConsistencySettings, MapFit
 from fcslam.graph.trajectory import Trajectory
 
 ExamineSessions = Callable[[tuple[str, str], Trajectory, Trajectory, Closures], MapFit | None]

@@ -10,9 +10,10 @@ from fcslam.cloud.joining import CONSISTENCY, ExamineSessions
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.sessions import robot_of
-from fcslam.graph.consistency import Closures, ConsistencySettings
-from fcslam.graph.evidence import MapFit
-from fcslam.graph.joint import INLIER_WEIGHT, JointEvidence, JointSolution, solve_jointly
+from fcslam.graph.consistency import Closures
+from fcslam.graph.evidence import ConsistencySettings, MapFit
+from fcslam.graph.joint import JointEvidence, JointSolution, solve_jointly
+from fcslam.graph.optimizer import INLIER_WEIGHT
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import ClosureStatus, FloatArray, Reason, ReasonCode, frozen

@@ -7,7 +7,7 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from fcslam.cloud.claims import ClaimLimits
 from fcslam.config import Settings
-from fcslam.graph.consistency import ConsistencySettings
+from fcslam.graph.evidence import ConsistencySettings
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.places.matcher import MatchDecision, MatcherConfig
 

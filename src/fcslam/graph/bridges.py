@@ -13,9 +13,6 @@ from fcslam.graph.evidence import MapFit, refutation
 Pair = tuple[int, int]
 """Two robots a < b."""
 
-_SEVERAL = 2
-"""Senders of one side that contradict the other side: one alone may be the one that is wrong."""
-
 
 CompareMaps = Callable[[int, int], MapFit]
 """Compares the maps of two robots at the joint poses."""
@@ -58,7 +55,7 @@ def _sides(ties: Collection[Pair], senders: Sequence[int], bridge: int) -> list[
 
 
 def _are_several(robots: Sequence[int], senders: Sequence[int]) -> bool:
-    return len({senders[robot] for robot in robots}) >= _SEVERAL
+    return len({senders[robot] for robot in robots}) > 1  # one alone may be the one that is wrong
 
 
 def _contradicting(side: Sequence[int], other: Sequence[int], compare: CompareMaps) -> list[Pair]:

@@ -6,7 +6,6 @@ deterministic.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +13,11 @@ from numpy.typing import NDArray
 NODE_BUDGET = 50_000
 """Largest number of branches; after them the best clique so far is returned as not proven ..."""
 
-VERTEX_BUDGET = 4_000_000
+VERTEX_BUDGET = 80 * NODE_BUDGET
 """... and of branches times vertices: a branch of a large graph takes longer."""
 
 
-@dataclass(frozen=True, slots=True)
-class Clique:
-    """Vertices that are pairwise adjacent."""
-
-    members: tuple[int, ...]
-    """Vertices in ascending order."""
-    exact: bool
-    """Whether it is proven that no larger clique exists."""
-
-
-def maximum_clique(adjacent: NDArray[np.bool_], node_budget: int = NODE_BUDGET) -> Clique:
+def maximum_clique(adjacent: NDArray[np.bool_], node_budget: int = NODE_BUDGET) -> tuple[list[int], bool]:
     """Find the largest clique of a graph.
 
     Args:
@@ -36,22 +25,20 @@ def maximum_clique(adjacent: NDArray[np.bool_], node_budget: int = NODE_BUDGET) 
         node_budget: largest number of branches.
 
     Returns:
-        The largest clique; if the budget ran out, the largest one found, at least the greedy one.
-
-    Raises:
-        ValueError: the matrix is not square or not symmetric.
+        The vertices of the largest clique in ascending order, and whether that is proven; if the budget ran out, the
+        largest one found, at least the greedy one.
     """
     matrix = np.asarray(adjacent, dtype=bool)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or (matrix != matrix.T).any():
         raise ValueError(f"an adjacency matrix is square and symmetric; this one has shape {matrix.shape}")
     size = len(matrix)
     if size == 0:
-        return Clique((), exact=True)
+        return [], True
     matrix = matrix & ~np.eye(size, dtype=bool)
     order = np.argsort(-matrix.sum(axis=1), kind="stable")
     neighbours = [_to_bits(row) for row in matrix[np.ix_(order, order)]]
     best, exact = _search(neighbours, min(node_budget, VERTEX_BUDGET // size))
-    return Clique(tuple(sorted(int(order[vertex]) for vertex in _bits(best))), exact)
+    return sorted(int(order[vertex]) for vertex in _bits(best)), exact
 
 
 def _search(neighbours: list[int], node_budget: int) -> tuple[int, bool]:

@@ -9,13 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import two_point_alignment
 from fcslam.graph.clique import maximum_clique
-from fcslam.graph.consistency import Closures, ConsistencySettings, pairwise_consistency
-from fcslam.graph.evidence import LEAD, ClusterEvidence, MapFit, refutation, shortfall
+from fcslam.graph.consistency import Closures, pairwise_consistency
+from fcslam.graph.evidence import LEAD, ClusterEvidence, ConsistencySettings, MapFit, refutation, shortfall
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray, Reason, ReasonCode
 
 Examine = Callable[[NDArray[np.int64]], MapFit | None]
-"""Compares the maps at the transform of some closures, given by their rows, shape (M,), and elsewhere."""
+"""Compares the maps at the transform of some closures, given by their rows, shape (M,), and elsewhere; None: the maps
+cannot be compared, and only separate places count."""
 
 _NO_LEAD = ReasonCode.NO_LEAD, ReasonCode.RIVAL_PLACES
 _MAPS_DECIDE = ReasonCode.NOT_INFORMATIVE, ReasonCode.FEW_PLACES, *_NO_LEAD
@@ -56,26 +57,13 @@ class ClusterDecision:
         return self.shortfall is None
 
 
-def not_examined(members: NDArray[np.int64]) -> None:
-    """Leave the maps unaligned: only separate places count."""
-
-
-CountTags = Callable[[NDArray[np.int64]], int]
-"""Counts the tags of some closures, given by their rows, shape (M,)."""
-
-
-def no_tags(_: NDArray[np.int64]) -> int:
-    """Count no tags."""
-    return 0
-
-
 def decide_cluster(
     a: Trajectory,
     b: Trajectory,
     closures: Closures,
     informative: ArrayLike,
     settings: ConsistencySettings,
-    examine: Examine = not_examined,
+    examine: Examine = lambda _: None,
 ) -> ClusterDecision:
     """Decide whether the closures between two robots have a dominant cluster.
 
@@ -155,8 +143,8 @@ def dominant_cluster(
     places: ArrayLike,
     informative: ArrayLike,
     settings: ConsistencySettings,
-    examine: Examine = not_examined,
-    shared_tags: CountTags = no_tags,
+    examine: Examine = lambda _: None,
+    shared_tags: Callable[[NDArray[np.int64]], int] = lambda _: 0,
 ) -> ClusterDecision:
     """Find the largest consistent cluster and decide whether it is enough to join two maps.
 
@@ -175,8 +163,8 @@ def dominant_cluster(
             one coordinate frame.
         informative: whether each closure fixes the pose in every direction, shape (K,).
         settings: what a cluster needs.
-        examine: called with the members of a cluster that has enough closures; None: the maps cannot be compared.
-        shared_tags: counts the tags among the members that both robots saw from several keyscans.
+        examine: called with the members of a cluster that has enough closures.
+        shared_tags: counts the tags among some rows, shape (M,), that both robots saw from several keyscans.
 
     Returns:
         The decision; its members are rows of ``consistent``.
@@ -206,12 +194,12 @@ def dominant_cluster(
 
     remaining, refuted = np.arange(len(consistent)), list[ClusterDecision]()
     for _ in range(MOST_CLUSTERS):
-        largest = maximum_clique(consistent[np.ix_(remaining, remaining)])
-        members = remaining[list(largest.members)]
+        largest, is_largest = maximum_clique(consistent[np.ix_(remaining, remaining)])
+        members = remaining[largest]
         others = np.flatnonzero(2 * consistent[:, members].sum(axis=1) <= len(members))
         others = np.setdiff1d(others, members)
-        second = maximum_clique(consistent[np.ix_(others, others)])
-        runner_up = others[list(second.members)]
+        second, is_second = maximum_clique(consistent[np.ix_(others, others)])
+        runner_up = others[second]
         evidence, reason = decide(members, runner_up)
         is_refuted = reason is not None and reason.code in _MAPS_REFUTE
         has_no_lead = reason is not None and reason.code in _NO_LEAD
@@ -219,7 +207,7 @@ def dominant_cluster(
             members=tuple(members.tolist()),
             runner_up=tuple(runner_up.tolist()),
             evidence=evidence,
-            exact=largest.exact and second.exact,
+            exact=is_largest and is_second,
             contested=is_refuted or (has_no_lead and evidence.rival_places >= settings.minimum_evidence),
             shortfall=reason,
         )
@@ -241,16 +229,9 @@ def evidence_of(places: FloatArray, informative: NDArray[np.bool_], tags: int, s
 
 
 def count_separate_places(places: FloatArray, separation_m: float) -> int:
-    """Count the places that lie at least ``separation_m`` from one another, on every side.
+    """Count the places (K, S, 2), as seen by S trajectories, that lie ``separation_m`` from one another on every side.
 
     A place of b that looks like three places of a counts once.
-
-    Args:
-        places: positions of K closures as seen by S trajectories, shape (K, S, 2), metres.
-        separation_m: least distance between two places, metres.
-
-    Returns:
-        Size of the largest such set.
     """
     gaps = np.hypot(*np.moveaxis(places[:, None] - places[None], -1, 0)).min(axis=-1, initial=np.inf)
-    return len(maximum_clique(gaps >= separation_m, _SEPARATE_BUDGET).members)
+    return len(maximum_clique(gaps >= separation_m, _SEPARATE_BUDGET)[0])

@@ -9,10 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from fcslam.geometry import se2
-from fcslam.graph.evidence import EvidenceSettings
 from fcslam.graph.pose_graph import CHI2_LIMIT
 from fcslam.graph.trajectory import Trajectory, transport_covariance
 from fcslam.records import FloatArray
@@ -24,14 +22,6 @@ SUPPORT_M = 10.0
 each other, metres."""
 TAG_VIEWS = 2
 """Keyscans of each trajectory from which a tag must be seen to be evidence: a tag misread once is none."""
-
-
-class ConsistencySettings(EvidenceSettings):
-    """When closures between two trajectories are consistent, and when they are enough to join two maps."""
-
-    separation_m: float = Field(
-        default=3.0, ge=0.0, description="least distance between two separate places, in the maps of both robots [m]"
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,9 +73,6 @@ def pairwise_consistency(a: Trajectory, b: Trajectory, closures: Closures) -> ND
 
     Returns:
         Which pairs are consistent, shape (K, K), symmetric, true on the diagonal.
-
-    Raises:
-        ValueError: a closure names a keyscan that its trajectory does not have.
     """
     _check(closures.i, len(a), "a")
     _check(closures.j, len(b), "b")

@@ -33,17 +33,15 @@ LEAST_RIVAL = 20.0
 """The support elsewhere is taken to be at least this, nats: maps with little wall in common are never unique."""
 LEAST_RATIO = 1.2
 """Least ratio of the support to that of a transform elsewhere, however many places agree."""
-FIXES_RATIO = 2.0
-"""Least ``MapFit.ratio`` of maps that fix the pose where no closure does."""
 LEAD = 2.0
-"""Least ratio of the closures of a cluster to those of the largest one that contradicts it."""
-RATIO_PLACES = 2.0
-"""Further places that maps replace which fit twice as well as elsewhere, and as well as those of one place do."""
-TAG_PLACES = 2.0
-"""Further places that a tag replaces, which both robots saw, if their maps do not contradict each other."""
+"""Least ratio of the closures of a cluster to those of the largest one that contradicts it, and least ``MapFit.ratio``
+of maps that fix the pose where no closure does."""
+FURTHER_PLACES = 2.0
+"""Further places that maps replace which fit twice as well as elsewhere, and as well as those of one place do; and that
+a tag replaces, which both robots saw, if their maps do not contradict each other."""
 
 
-class EvidenceSettings(Settings):
+class ConsistencySettings(Settings):
     """How much evidence joins two maps."""
 
     minimum_closures: int = Field(
@@ -54,6 +52,9 @@ class EvidenceSettings(Settings):
         ge=0.0,
         description="evidence that a cluster needs to join two maps: its separate places, plus twice the ratio by "
         "which the maps fit better than elsewhere, less one",
+    )
+    separation_m: float = Field(
+        default=3.0, ge=0.0, description="least distance between two separate places, in the maps of both robots [m]"
     )
 
 
@@ -115,7 +116,7 @@ class ClusterEvidence:
     """None if the maps were not compared."""
 
 
-def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
+def shortfall(evidence: ClusterEvidence, settings: ConsistencySettings) -> Reason | None:
     """Why the evidence is not enough to join two maps; None if it is.
 
     Where the maps agree clearly, they decide between clusters that contradict each other, and not the number of
@@ -132,7 +133,7 @@ def shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason |
 
 
 def _pose_shortfall(evidence: ClusterEvidence) -> Reason | None:
-    if evidence.informative or (evidence.fit is not None and evidence.fit.ratio >= FIXES_RATIO):
+    if evidence.informative or (evidence.fit is not None and evidence.fit.ratio >= LEAD):
         return None
     return Reason(ReasonCode.NOT_INFORMATIVE, evidence.closures)
 
@@ -156,13 +157,13 @@ def refutation(fit: MapFit) -> Reason | None:
     return None
 
 
-def _amount_shortfall(evidence: ClusterEvidence, settings: EvidenceSettings) -> Reason | None:
+def _amount_shortfall(evidence: ClusterEvidence, settings: ConsistencySettings) -> Reason | None:
     places, fit, least = evidence.separate_places, evidence.fit, settings.minimum_evidence
     if places >= least:
         return None
     if fit is None:
         return Reason(ReasonCode.FEW_PLACES, places, least, "minimum_evidence")
-    by_walls = RATIO_PLACES * min(max(0.0, fit.ratio - 1.0), fit.likeness)
-    if places + by_walls + (TAG_PLACES if evidence.tags else 0.0) >= least:
+    by_walls = FURTHER_PLACES * min(max(0.0, fit.ratio - 1.0), fit.likeness)
+    if places + by_walls + (FURTHER_PLACES if evidence.tags else 0.0) >= least:
         return None
-    return Reason(ReasonCode.NOT_UNIQUE, fit.ratio, 1.0 + (least - places) / RATIO_PLACES, "minimum_evidence")
+    return Reason(ReasonCode.NOT_UNIQUE, fit.ratio, 1.0 + (least - places) / FURTHER_PLACES, "minimum_evidence")

@@ -138,7 +138,7 @@ class FactorCache:
         roots = _roots(edges.information[rows]) * scales[numbers, None, None]
         columns = zip(edges.i[rows].tolist(), edges.j[rows].tolist(), edges.T_i_j[rows].tolist(), roots, strict=True)
         for i, j, T_i_j, root in columns:
-            yield _between(i, j, gtsam.Pose2(*T_i_j), _under(loss, _gaussian(root)))
+            yield _between(i, j, T_i_j, root, loss)
 
     def _anchor(
         self, graph: Any, kept: NDArray[np.bool_], poses: FloatArray, solved: NDArray[np.bool_] | None = None
@@ -164,7 +164,7 @@ class FactorCache:
     ) -> None:
         roots = _roots(information)
         for first, last, motion, root in zip(i.tolist(), j.tolist(), T_i_j.tolist(), roots, strict=True):
-            self._trusted.push_back(_between(first, last, gtsam.Pose2(*motion), _gaussian(root)))
+            self._trusted.push_back(_between(first, last, motion, root))
 
 
 def to_values(poses: ArrayLike, rows: Sequence[int] | None = None) -> Any:
@@ -181,18 +181,11 @@ def from_values(values: Any) -> FloatArray:
     return poses
 
 
-def _between(i: int, j: int, measured: Any, noise: Any) -> Any:
-    return gtsam.BetweenFactorPose2(i, j, measured, noise)
-
-
-def _gaussian(root: FloatArray) -> Any:
-    return gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
-
-
-def _under(loss: Loss, noise: Any) -> Any:
-    if loss is Loss.SQUARED:
-        return noise
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_WIDTH), noise)
+def _between(i: int, j: int, T_i_j: list[float], root: FloatArray, loss: Loss = Loss.SQUARED) -> Any:
+    noise: Any = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+    if loss is Loss.CAUCHY:
+        noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_WIDTH), noise)
+    return gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*T_i_j), noise)
 
 
 def _roots(information: FloatArray) -> FloatArray:

@@ -19,9 +19,6 @@ def g2o_text(graph: PoseGraph, ids: Sequence[int]) -> str:
     Args:
         graph: the pose graph.
         ids: id of each variable.
-
-    Raises:
-        ValueError: the number of ids is not that of the variables, or two ids are equal.
     """
     if len(ids) != len(graph) or len(set(ids)) != len(ids):
         raise ValueError(f"{len(graph)} variables need as many different ids, not {len(ids)}")

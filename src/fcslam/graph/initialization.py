@@ -66,11 +66,6 @@ def initialize_robust(graph: PoseGraph) -> FloatArray:
     graph of 1,228 poses with as many random false closures as true ones. From here it keeps every true closure and
     rejects every false one; from odometry it loses two thirds of the true ones.
 
-    Args:
-        graph: N variables.
-
-    Returns:
-        Poses, shape (N, 3), metres and radians.
     """
     robust = graph.arrays().robust
     weights = np.ones(len(robust))

@@ -8,7 +8,6 @@ closure.
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +22,11 @@ from fcslam.graph.cluster import (
     evidence_of,
     relative_frame,
 )
-from fcslam.graph.consistency import Closures, ConsistencySettings, count_supporting_closures
-from fcslam.graph.evidence import MapFit, shortfall
+from fcslam.graph.consistency import Closures, count_supporting_closures
+from fcslam.graph.evidence import ConsistencySettings, MapFit, shortfall
 from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize
-from fcslam.graph.optimizer import Solution, optimize_gnc, refine_inliers
+from fcslam.graph.optimizer import INLIER_WEIGHT, Solution, optimize_gnc, refine_inliers
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.graph.single_robot import robot_trajectory, solve_single_robot
 from fcslam.graph.trajectory import Trajectory
@@ -43,9 +42,6 @@ shape (N, 3) each."""
 
 _Relation = tuple[int, int, FloatArray]
 """Two robots a and b, and the transform T_a_b between their own frames, shape (3,)."""
-
-INLIER_WEIGHT = 0.5
-"""Weight above which a closure is an inlier: graduated non-convexity ends at weight 1 (inlier) or 0 (outlier)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,20 +107,11 @@ class JointSolution:
     """Pairs of robots a < b that closures would join, and that stay apart because maps contradict each other."""
 
 
-def not_examined(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members: Closures) -> None:
-    """Leave the maps unaligned: only separate places count."""
-
-
-def not_compared(*_: object) -> MapFit:
-    """Leave the joint maps uncompared: nothing contradicts."""
-    return MapFit()
-
-
 def solve_jointly(
     evidence: JointEvidence,
     consistency: ConsistencySettings,
-    examine: ExaminePair = not_examined,
-    compare: CompareJointMaps = not_compared,
+    examine: ExaminePair = lambda *_: None,
+    compare: CompareJointMaps = lambda *_: MapFit(),
 ) -> JointSolution:
     """Find poses, maps and inlier closures from the evidence alone; no earlier estimate plays a part.
 
@@ -207,25 +194,16 @@ def _solve_own_graph(
 def _find_links(
     evidence: JointEvidence, own: Sequence[Trajectory], settings: ConsistencySettings, examine: ExaminePair
 ) -> list[Link]:
-    links = []
-    for a, b, rows, closures in _pairs(evidence, evidence.independent & ~evidence.excluded):
-        examine_members = partial(_examine, examine, (a, b), own, closures)
+    def link(a: int, b: int, rows: NDArray[np.int64], closures: Closures) -> Link:
+        def examine_members(members: NDArray[np.int64]) -> MapFit | None:
+            return examine(a, b, own[a], own[b], closures.select(members))
+
         decision = decide_cluster(own[a], own[b], closures, evidence.informative[rows], settings, examine_members)
         members = closures.select(np.array(decision.members, dtype=np.int64))
         T_a_b = relative_frame(own[a], own[b], members) if decision.dominant else None
-        links.append(Link(a, b, rows, decision, closures, T_a_b))
-    return links
+        return Link(a, b, rows, decision, closures, T_a_b)
 
-
-def _examine(
-    examine: ExaminePair,
-    robots: tuple[int, int],
-    own: Sequence[Trajectory],
-    closures: Closures,
-    members: NDArray[np.int64],
-) -> MapFit | None:
-    a, b = robots
-    return examine(a, b, own[a], own[b], closures.select(members))
+    return [link(*pair) for pair in _pairs(evidence, evidence.independent & ~evidence.excluded)]
 
 
 def _pairs(
@@ -415,7 +393,6 @@ def _owners(evidence: JointEvidence) -> tuple[NDArray[np.int64], NDArray[np.int6
 
 
 def _expand_weights(solution: Solution, kept: NDArray[np.bool_]) -> Solution:
-    """The solution of a subgraph with weights of the whole graph, shape (E,): edges left out have weight 0."""
     weights = np.zeros(len(kept))
     weights[kept] = solution.weights
     return replace(solution, weights=frozen(weights))

@@ -21,16 +21,14 @@ _MAXIMUM_ITERATIONS = 100
 """Limit of Levenberg-Marquardt's iterations; it converges long before."""
 _BINARY = 1e-4
 """Distance from 0 or 1 at which a weight is decided."""
-_TRUSTED_WEIGHT = 0.5
-"""A closure of a larger weight is trusted at the start of a refinement."""
+INLIER_WEIGHT = 0.5
+"""Weight above which a closure is an inlier: graduated non-convexity ends at weight 1 (inlier) or 0 (outlier)."""
 _REFINEMENT_ROUNDS = 200
 """Limit of alternating solves and decisions, which end by themselves."""
-_FIRST_ITERATIONS, _STEP_ITERATIONS = 5, 1
-"""Solver iterations of graduated non-convexity, with all closures before the first step, and in each step."""
+_FIRST_ITERATIONS = 5
+"""Solver iterations of graduated non-convexity with all closures, before steps of one iteration each."""
 _CONTROL_STEP = 1.4
 """Factor of its control parameter from step to step, which sharpens the loss."""
-_MAXIMUM_STEPS = 100
-"""Largest number of its steps; closures that are still undecided are then decided by their residuals."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,9 +67,6 @@ def optimize(
 
     Returns:
         Poses (N, 3) and weights (E,).
-
-    Raises:
-        ValueError: ``initial`` does not fit the graph, or ``factors`` belong to another graph.
     """
     start, cache = _start(graph, initial), _cache(graph, factors)
     if not graph.edges:
@@ -102,16 +97,7 @@ def optimize_gnc(
     (``benchmarks/results/graph.md``, m3500 with 100 random false loops). Neither is sure to find the best set: the
     drift of the odometry may favour a false loop.
 
-    Args:
-        graph: N variables and E edges.
-        initial: poses to start from, shape (N, 3), odometry or better; None: the graph's own.
-        factors: as in ``optimize``.
-
-    Returns:
-        Poses (N, 3) and weights (E,).
-
-    Raises:
-        ValueError: as ``optimize``.
+    ``initial`` is odometry or better. Arguments and result as of ``optimize``.
     """
     start, cache = _start(graph, initial), _cache(graph, factors)
     robust = graph.arrays().robust
@@ -136,17 +122,7 @@ def refine_inliers(
     The last part of ``optimize_gnc``, from closures that are trusted already: for graphs most of whose closures are
     false, where optimizing with all of them gives no useful start.
 
-    Args:
-        graph: N variables and E edges.
-        initial: poses to start from, shape (N, 3); None: the graph's own.
-        weights: weights of the edges, shape (E,); closures above one half are trusted at the start.
-        factors: as in ``optimize``.
-
-    Returns:
-        Poses (N, 3) and weights (E,).
-
-    Raises:
-        ValueError: ``weights`` do not fit the graph, or as ``optimize``.
+    ``weights`` (E,): edges above one half are trusted at the start. Other arguments and result as of ``optimize``.
     """
     start, cache = _start(graph, initial), _cache(graph, factors)
     trusted = np.asarray(weights, dtype=np.float64)
@@ -156,7 +132,7 @@ def refine_inliers(
         return _solution(graph, start, start, np.ones(0), 0, 0.0)
     robust = graph.arrays().robust
     steps = _Steps(cache, start)
-    decided = _alternate(steps, (trusted[robust] > _TRUSTED_WEIGHT).astype(np.float64))
+    decided = _alternate(steps, (trusted[robust] > INLIER_WEIGHT).astype(np.float64))
     return _with_truncated_cost(graph, start, steps, decided)
 
 
@@ -188,20 +164,17 @@ def _graduate(steps: _Steps) -> None:
     if largest <= CHI2_LIMIT:
         return
     mu = CHI2_LIMIT / (2.0 * largest - CHI2_LIMIT)
-    for _ in range(_MAXIMUM_STEPS):
+    for _ in range(_MAXIMUM_ITERATIONS):  # closures that are then still undecided are decided by their residuals
         weights = _truncated_weights(chi2, mu)
         if np.all((weights < _BINARY) | (weights > 1.0 - _BINARY)):
             return
-        steps.solve(weights, _STEP_ITERATIONS)
+        steps.solve(weights, iterations=1)
         chi2 = steps.chi2()
         mu *= _CONTROL_STEP
 
 
 def _alternate(steps: _Steps, weights: FloatArray) -> FloatArray:
-    """Alternate solve and decision until no decision changes; returns the weights of the last solve.
-
-    Each round lowers the truncated loss, so it ends by itself; the limit covers the tolerance of the solver.
-    """
+    """Alternate solve and decision until no decision changes, each of which lowers the truncated loss."""
     for _ in range(_REFINEMENT_ROUNDS):
         steps.solve(weights, _MAXIMUM_ITERATIONS)
         decided = (steps.chi2() <= CHI2_LIMIT).astype(np.float64)

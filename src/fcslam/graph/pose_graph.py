@@ -21,20 +21,15 @@ _MINIMUM_INFORMATION = 1e-4
 _ASYMMETRY = 1e-6
 """Largest relative asymmetry of an information matrix that counts as rounding."""
 
-CHI2_LIMIT = 11.344866730144373
-"""The chi-square of a motion, with its three degrees of freedom, stays below with ``PROBABILITY``."""
 PROBABILITY = 0.99
 """Probability with which the error of a true closure passes the chi-square test."""
+CHI2_LIMIT = 11.344866730144373
+"""Chi-square of a motion, with its three degrees of freedom, for this probability."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edge:
-    """A measured motion between two variables.
-
-    Raises:
-        ValueError: the two variables are the same, a number is not finite, or the information is not symmetric
-            positive definite (asymmetry by rounding is repaired).
-    """
+    """A measured motion between two variables."""
 
     i: int
     j: int
@@ -100,19 +95,11 @@ class PoseGraph:
         return self._edges
 
     def add_variable(self, pose: ArrayLike) -> int:
-        """Append a variable with its initial pose (3,); returns its number.
-
-        Raises:
-            ValueError: the pose is not three finite numbers.
-        """
+        """Append a variable with its initial pose (3,); returns its number."""
         return self._poses.append(_checked(pose, (3,), f"variable {len(self)}"))
 
     def add_edge(self, edge: Edge) -> int:
-        """Append an edge; returns its number.
-
-        Raises:
-            ValueError: the edge names a variable that the graph does not have.
-        """
+        """Append an edge; returns its number."""
         if max(edge.i, edge.j) >= len(self):
             raise ValueError(f"edge {edge.i} -> {edge.j}: the graph has variables 0 to {len(self) - 1}")
         return self._edges.append(edge)

@@ -70,15 +70,7 @@ def _robust_start(graph: PoseGraph, chains: Chains | None) -> FloatArray:
 
 
 def robot_trajectory(graph: PoseGraph, poses: FloatArray) -> Trajectory:
-    """The trajectory of one robot, with the covariance that the odometry edges of its graph state.
-
-    Args:
-        graph: N variables of one robot in the order of its path.
-        poses: poses of the variables, shape (N, 3), metres and radians, in one coordinate frame.
-
-    Returns:
-        The trajectory through ``poses``.
-    """
+    """The trajectory of one robot through ``poses`` (N, 3), with the covariance of the odometry of its graph."""
     edges = graph.arrays()
     covariance = np.tile(_UNMEASURED_VARIANCE * np.eye(3), (max(0, len(graph) - 1), 1, 1))
     steps = ~edges.robust & (edges.j == edges.i + 1)

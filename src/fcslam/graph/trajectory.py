@@ -30,15 +30,7 @@ class Trajectory:
         return len(self.poses)
 
     def drift(self, start: NDArray[np.int64], end: NDArray[np.int64]) -> FloatArray:
-        """Covariance of the motions between pairs of poses.
-
-        Args:
-            start: rows of the first poses, shape (P,).
-            end: rows of the second poses, shape (P,).
-
-        Returns:
-            Covariances, shape (P, 3, 3), over (x, y, theta) in metres and radians, in the tangent space at ``end``.
-        """
+        """Covariance (P, 3, 3) of the motions between the poses of two rows each, in the tangent space at ``end``."""
         low, high = np.minimum(start, end), np.maximum(start, end)
         return transport_covariance(
             self._covariance[high] - self._covariance[low], se2.between(self._centre, self.poses[end])
@@ -46,15 +38,10 @@ class Trajectory:
 
 
 def build_trajectory(poses: ArrayLike, step_covariance: ArrayLike | None = None) -> Trajectory:
-    """Accumulate the covariance along a path, that of ``DRIFT`` included.
+    """Accumulate the covariance along a path of poses (N, 3), that of ``DRIFT`` included.
 
-    Args:
-        poses: shape (N, 3), metres and radians, in the robot's own coordinate frame.
-        step_covariance: covariance of each step in the tangent space at its end, shape (N - 1, 3, 3); None takes the
-            steps as exact.
-
-    Returns:
-        The trajectory.
+    ``step_covariance`` is that of each step in the tangent space at its end, shape (N - 1, 3, 3); None takes the steps
+    as exact.
     """
     x = np.asarray(poses, dtype=np.float64).reshape(-1, 3)
     length = np.hypot(*np.diff(x[:, :2], axis=0).T)
@@ -70,15 +57,7 @@ def build_trajectory(poses: ArrayLike, step_covariance: ArrayLike | None = None)
 
 
 def transport_covariance(covariance: FloatArray, T: FloatArray) -> FloatArray:
-    """Move a covariance from one tangent space to another.
-
-    Args:
-        covariance: shape (..., 3, 3), in the tangent space before the motion.
-        T: the motion, shape (..., 3).
-
-    Returns:
-        The same covariance in the tangent space after the motion, shape (..., 3, 3).
-    """
+    """Move a covariance (..., 3, 3) from the tangent space before a motion ``T`` (..., 3) to the one after it."""
     adjoint = se2.adjoint(se2.inverse(T))
     moved: FloatArray = adjoint @ covariance @ adjoint.swapaxes(-1, -2)
     return moved

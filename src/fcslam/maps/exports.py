@@ -49,9 +49,6 @@ def export_map(folder: Path, number: int, suffix: str) -> bytes | None:
     """A map of a run folder as ``svg`` or ``tif``, or its ``pgm`` and ``yaml`` as ``zip``.
 
     None if there is no such map, or if a GeoTIFF is asked for and the map's place on the earth is unknown.
-
-    Raises:
-        InputError: the files of the map are broken.
     """
     stem = map_stem(number)
     try:

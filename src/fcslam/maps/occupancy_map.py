@@ -149,10 +149,6 @@ def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
         name: what messages call the map.
         pgm: content of the image file.
         description: content of the YAML file; the image that it names is not opened.
-
-    Raises:
-        InputError: the image is not a binary PGM of its stated size, or the description is incomplete, contains a
-            number that is out of range, or rotates or negates the image.
     """
     image = parse_image(name, pgm, description)
     cells = frozen(_looked_up(image.meaning, image.pixels), np.uint8)
@@ -193,9 +189,6 @@ def _own_description(description: str) -> tuple[float, tuple[float, float], floa
 def read_description(description: str) -> tuple[dict[str, Any], float, tuple[float, float, float], float, float]:
     """Content, resolution (m), origin (x, y in m, theta in rad) and thresholds of occupied and of free cells in the
     YAML file of a map, of whatever program.
-
-    Raises:
-        ValueError: it is not a description, or a number is missing or out of range.
     """
     content: Any = parse_yaml(description)
     if not isinstance(content, dict):
@@ -210,11 +203,7 @@ def read_description(description: str) -> tuple[dict[str, Any], float, tuple[flo
 
 
 def check_place(resolution_m: float, x: float, y: float) -> None:
-    """Check resolution and origin of a map: far off, its cells have no finite size or place.
-
-    Raises:
-        ValueError: one is out of range.
-    """
+    """Check resolution and origin of a map: far off, its cells have no finite size or place."""
     if not FINEST_M <= resolution_m <= COARSEST_M:
         raise ValueError(f"`resolution` is {resolution_m:g}; give the side of a cell, {FINEST_M:g} to {COARSEST_M:g} m")
     if max(abs(x), abs(y)) > FARTHEST_M:
@@ -222,11 +211,7 @@ def check_place(resolution_m: float, x: float, y: float) -> None:
 
 
 def number_in(description: Mapping[str, object], key: str) -> float:
-    """A finite number of the description; YAML 1.1 reads ``5e-2`` as text.
-
-    Raises:
-        ValueError: it is missing or not a finite number.
-    """
+    """A finite number of the description; YAML 1.1 reads ``5e-2`` as text."""
     value = description.get(key)
     try:
         number = float(value) if isinstance(value, int | float | str) else math.nan

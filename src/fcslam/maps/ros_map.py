@@ -41,10 +41,6 @@ def parse_ros_map(name: str, image: bytes, description: str) -> OccupancyMap:
         name: what messages call the map.
         image: content of the image file.
         description: content of the YAML file; the image that it names is not opened.
-
-    Raises:
-        InputError: the image cannot be read, the description is incomplete or contains a number that is out of
-            range, or there are no walls or no floor by its thresholds.
     """
     try:
         return _map(image, description)
@@ -53,11 +49,7 @@ def parse_ros_map(name: str, image: bytes, description: str) -> OccupancyMap:
 
 
 def read_ros_map(path: Path) -> OccupancyMap:
-    """Read a map from its YAML file and the image that it names.
-
-    Raises:
-        SourceError: the files cannot be read as a map.
-    """
+    """Read a map from its YAML file and the image that it names."""
     try:
         text = read_text(path, most=MOST_TEXT_BYTES)
         image = parse_yaml(text)["image"]

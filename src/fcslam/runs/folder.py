@@ -93,11 +93,7 @@ class Run:
 
     @cached_property
     def maps(self) -> Mapping[int, OccupancyMap]:
-        """The occupancy maps, by index; most robots are in map 0. Decoded at the first use.
-
-        Raises:
-            InputError: a map file is broken or has no description.
-        """
+        """The occupancy maps, by index; most robots are in map 0. Decoded at the first use."""
         decoded = {}
         for name, pgm in self.map_files.items():
             if match := _MAP_FILE.fullmatch(name):
@@ -111,10 +107,6 @@ class Run:
         Args:
             folder: the folder to make; its parents are made too.
             force: replace a run that is there.
-
-        Raises:
-            InputError: something else is there, a run is there and ``force`` is not given, a robot's name cannot be a
-                file name, or writing fails.
         """
         check_names([*self.trajectories, *self.local_maps, *self.map_files])
         place = prepare_output(Path(folder), force)
@@ -126,11 +118,7 @@ class Run:
 
 
 def prepare_output(path: Path, force: bool = False) -> Path:
-    """Check, before the long work, that a run folder can be put at ``path``; its parents are made.
-
-    Raises:
-        InputError: something else is there, a run is there and ``force`` is not given, or it cannot be written.
-    """
+    """Check, before the long work, that a run folder can be put at ``path``; its parents are made."""
     place = path.resolve()
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -152,11 +140,7 @@ def prepare_output(path: Path, force: bool = False) -> Path:
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Check, before the long work, that robots' names can be file names.
-
-    Raises:
-        InputError: one cannot.
-    """
+    """Check, before the long work, that robots' names can be file names."""
     for name in names:
         if not _SAFE_NAME.fullmatch(name):
             raise InputError(f"{name!r} cannot be a file name; use letters, digits, '_', '-', '+' and '.'")
@@ -183,9 +167,6 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
     Args:
         folder: the run folder.
         maps: read the maps, the pose graph and the mission file too, which may be large.
-
-    Raises:
-        InputError: ``folder`` is not a run folder, or a file of it is missing or broken.
     """
     path = Path(folder)
     if not is_run_folder(path):

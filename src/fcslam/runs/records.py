@@ -73,11 +73,7 @@ class LocalMap:
     """For ROS map_server; names the PGM file ``<robot>.pgm``."""
 
     def occupancy(self) -> OccupancyMap:
-        """The robot's own occupancy map.
-
-        Raises:
-            InputError: ``pgm`` or ``yaml`` is broken.
-        """
+        """The robot's own occupancy map."""
         return parse_map(f"the own map of {self.robot}", self.pgm, self.yaml)
 
 
