@@ -629,33 +629,3 @@ def test_a_laser_mounted_in_centimetres_or_millimetres(tmp_path, name, away):
     pose = tf(100.0, "base_link", "laser", (away, 0.0, 0.3), quaternion(0.0), topic="/tf_static")
     said = [pose, *without(drive(), "/tf_static")]
     assert f"puts the laser of /scan {away:.0f} m from 'base_link'" in refusal(save(tmp_path / name, said))
-
-
-@pytest.mark.parametrize("name", FILES)
-@pytest.mark.parametrize("period_s", [0.02, 0.1])
-def test_headings_in_degrees(tmp_path, name, period_s):
-    """The robot turns by 0.4 rad/s on average."""
-    times = np.arange(0.0, 20.0, period_s)
-    headings = 0.4 * times + 0.5 * np.sin(0.7 * times)
-    for unit in (1.0, 180.0 / math.pi):
-        poses = np.column_stack((np.cumsum(np.cos(headings)), np.cumsum(np.sin(headings)), unit * headings))
-        poses *= 0.5 * period_s, 0.5 * period_s, 1.0
-        readings = [odom(100.0 + at, pose) for at, pose in zip(times.tolist(), poses.tolist(), strict=True)]
-        bag = save(tmp_path / f"{unit:.0f}-{name}", [*readings, *without(drive(90), "/odom")])
-        if unit == 1.0:
-            assert not open_source(bag).survey().notes
-        else:
-            assert "rad in 20 s, as if in degrees" in refusal(bag)
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_odometry_of_two_nodes_that_differ_a_little_is_noticed(tmp_path, name):
-    said = drive()
-    times = [0.1 * k + 0.03 for k in range(80)]
-    other = [odom(100.0 + at, (pose_at(at)[0] + 0.2, *pose_at(at)[1:])) for at in times]
-    healthy = open_source(save(tmp_path / f"one-{name}", said))
-    twice = open_source(save(tmp_path / f"two-{name}", [*said, *other]))
-    assert not any("back and forth" in note for note in healthy.survey().notes)
-    (note,) = (note for note in twice.survey().notes if "back and forth" in note)
-    assert "/odom goes back and forth at 1" in note
-    assert "as if two nodes published it; stop one of them" in note

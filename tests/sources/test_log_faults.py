@@ -122,31 +122,6 @@ def test_one_long_jump_of_the_odometry_is_not_another_unit(tmp_path):
     assert open_source(save(tmp_path / "run.log", lines)).survey().scan_count == 30
 
 
-def round_trip(laps=3.0, ahead=0.0):
-    """Poses of a robot on a circle of 2 m, 0.15 m apart; it looks ``ahead`` of where it drives."""
-    turns = np.arange(0.0, laps * 2.0 * np.pi, 0.075)
-    return np.column_stack((2.0 * np.sin(turns), 2.0 - 2.0 * np.cos(turns), turns + ahead))
-
-
-@pytest.mark.parametrize("wrap", [True, False])
-def test_headings_in_degrees_are_refused(tmp_path, wrap):
-    poses = round_trip() * (1.0, 1.0, 180.0 / np.pi)
-    if wrap:
-        poses[:, 2] = (poses[:, 2] + 180.0) % 360.0 - 180.0
-    log = save(tmp_path / "run.log", [flaser(0.2 * k, pose) for k, pose in enumerate(poses.round(4).tolist())])
-    assert "the headings of the odometry are in degrees" in refusal(log)
-
-
-@pytest.mark.parametrize("kind", ["forward", "backward", "sideways", "in all directions"])
-def test_headings_in_radians_may_go_beyond_a_turn(tmp_path, kind):
-    """Also those of a robot that drives in other directions than ahead."""
-    poses = round_trip(laps=5.0, ahead={"backward": np.pi, "sideways": 1.5}.get(kind, 0.0))
-    if kind == "in all directions":
-        poses[:, 2] = np.linspace(0.0, 40.0, len(poses)) * np.sin(np.arange(len(poses)))
-    lines = [flaser(0.2 * k, pose) for k, pose in enumerate(poses.round(4).tolist())]
-    assert open_source(save(tmp_path / "run.log", lines)).survey().scan_count == len(poses)
-
-
 def test_a_change_of_the_laser_is_refused_with_its_line(tmp_path):
     message = refusal(save(tmp_path / "run.log", drive(30) + drive(31, start_stamp=200, beams=9)))
     assert "line 62: 31 scans are not of the laser of the first ones" in message

@@ -265,7 +265,6 @@ class RosBag:
             *plan.topics.notes,
             *plan.odometry_notes,
             *self._clock_notes(),
-            *self._zigzag_notes(odometry),
             *tilts,
             *several_parents,
             *camera_notes,
@@ -306,12 +305,6 @@ class RosBag:
                 "odom-topic=none"
             )
         check_units(path, scans)
-        source = self.plan.odometry
-        if source is not None and (spins := odometry.spins) is not None:
-            raise SourceError(
-                f"{path}: {source.name} {spins}, as if in degrees, or of two robots; publish a quaternion made from "
-                "radians, or map without it by --sensors odom-topic=none"
-            )
 
     def _clock_notes(self) -> list[str]:
         return [
@@ -319,15 +312,6 @@ class RosBag:
             "before, so their times of recording are used; let the driver set the stamps, with their nanoseconds"
             for name, clock in self.plan.clocks.items()
             if clock.is_unset and clock.is_recorded
-        ]
-
-    def _zigzag_notes(self, odometry: PathSummary) -> list[str]:
-        source, zigzag = self.plan.odometry, odometry.zigzag
-        if source is None or zigzag is None:
-            return []
-        return [
-            f"{self.path}: {source.name} {zigzag}; stop one of them, or choose another odometry by --sensors "
-            "odom-topic, or none to map without"
         ]
 
     def _mountings(self, base_frame: str, errors: Mapping[str, str]) -> list[Mounting]:
