@@ -13,9 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fcslam.errors import SourceError
-from fcslam.records import LaserModel, LaserScan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.sources import BagOptions, Fault, FaultCount, open_fleet, open_source, write_bag
+from fcslam.sources import BagOptions, Fault, FaultCount, open_fleet, open_source
 from tests.sources.bag_messages import (
     LASER_POSE,
     Said,
@@ -193,78 +192,6 @@ def test_clocks_that_differ_also_in_the_times_of_recording(tmp_path):
 
 
 # Time
-
-
-def whole_seconds(said, topics, recorded=False):
-    """The messages of some topics without nanoseconds; ``recorded``: also in the times of recording."""
-    for each in said:
-        stamp = math.floor(each.fields["stamp"]) if each.topic in topics else each.fields["stamp"]
-        bag_time = stamp if recorded and each.topic in topics else each.bag_time
-        yield each._replace(fields={**each.fields, "stamp": stamp}, bag_time=bag_time)
-
-
-@pytest.mark.parametrize("topics", [("/scan",), ("/odom",), ("/scan", "/odom")])
-@pytest.mark.parametrize("name", FILES)
-def test_stamps_without_nanoseconds_give_way_to_the_times_of_recording(tmp_path, name, topics):
-    usual = scans_of(open_source(save(tmp_path / f"usual-{name}", drive())))
-    source = open_source(save(tmp_path / name, whole_seconds(drive(), topics)))
-    for expected, found in zip(usual, scans_of(source), strict=True):
-        assert found.stamp == pytest.approx(expected.stamp, abs=0.03)
-        np.testing.assert_allclose(found.T_odom_base, expected.T_odom_base, atol=0.03)
-    (*_, note) = source.survey().notes
-    assert f"messages of {topics[-1]} repeat the stamp of the one before, so their times of recording are used" in note
-
-
-def test_odometry_without_nanoseconds_of_a_robot_that_mostly_stands(tmp_path):
-    still = [odom(60.0 + 0.1 * k, pose_at(-0.1)) for k in range(390)]
-    source = open_source(save(tmp_path / "run.bag", whole_seconds([*still, *drive()], ("/odom",))))
-    assert any("messages of /odom repeat the stamp of the one before" in note for note in source.survey().notes)
-
-
-def test_odometry_in_tf_without_nanoseconds(tmp_path):
-    said = [
-        tf(each.bag_time, "odom", "base_link", each.fields["at"], each.fields["rotation"], bag_time=each.bag_time)
-        if each.topic == "/odom"
-        else each
-        for each in drive()
-    ]
-    usual = scans_of(open_source(save(tmp_path / "usual.bag", said)))
-    source = open_source(save(tmp_path / "run.bag", whole_seconds(said, ("/tf",))))
-    for expected, found in zip(usual, scans_of(source), strict=True):
-        np.testing.assert_allclose(found.T_odom_base, expected.T_odom_base, atol=0.03)
-    assert any("messages of tf from odom to base_link repeat the stamp" in note for note in source.survey().notes)
-
-
-def test_stamps_without_nanoseconds_that_were_recorded_with_them(tmp_path):
-    message = refusal(save(tmp_path / "run.bag", whole_seconds(drive(), ("/scan",), recorded=True)))
-    assert "32 messages of /scan repeat the stamp of the one before, and its time of recording" in message
-
-
-def test_a_bag_from_a_log_with_whole_seconds_keeps_its_order(tmp_path):
-    poses = [(100 + k // 5, pose_at(0.2 * k)) for k in range(40)]
-    scans = [
-        LaserScan(stamp, np.full(8, 1.0 + 0.01 * k, np.float32), LaserModel(8, -1.0, 0.25, 20.0), np.array(pose))
-        for k, (stamp, pose) in enumerate(poses)
-    ]
-    write_bag(tmp_path / "run.bag", scans)
-    source = open_source(tmp_path / "run.bag")
-    for k, found in enumerate(scans_of(source)):
-        np.testing.assert_allclose(found.T_odom_base, poses[k][1], atol=1e-6)
-    assert not source.survey().notes
-
-
-def test_odometry_that_is_published_again_keeps_its_stamps(tmp_path):
-    said = [
-        each._replace(bag_time=each.bag_time + 0.01 * k)
-        for each in drive()
-        for k in range(3 if each.topic == "/odom" else 1)
-    ]
-    source = open_source(save(tmp_path / "run.bag", said))
-    for expected, found in zip(
-        scans_of(open_source(save(tmp_path / "usual.bag", drive()))), scans_of(source), strict=True
-    ):
-        np.testing.assert_allclose(found.T_odom_base, expected.T_odom_base, atol=1e-6)
-    assert not source.survey().notes
 
 
 def test_three_recordings_put_together(tmp_path):

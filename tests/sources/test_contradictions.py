@@ -1,11 +1,9 @@
 """Scans that say nothing or contradict the odometry are counted, and nothing else is."""
 
 import numpy as np
-import pytest
 
-from fcslam.errors import SourceError
 from fcslam.records import LaserModel, LaserScan, frozen
-from fcslam.sources import Fault, open_source, write_bag
+from fcslam.sources import Fault
 from fcslam.sources.contradictions import RepeatedScans, ScanWatch
 from fcslam.sources.faults import Audit, FaultCount
 from tests.lidar.worlds import corridor, drive, ranges, room
@@ -76,25 +74,6 @@ def test_a_robot_at_rest_may_see_the_same_again():
     still = np.zeros((30, 3))
     for odometry in (still, np.full((30, 3), np.nan)):
         assert not faults(still, odometry, change=freeze)
-
-
-@pytest.mark.parametrize("each", [1, 3])
-def test_two_lasers_on_one_topic_are_refused(tmp_path, each):
-    """A second laser, turned by a right angle, publishes as well; ``each``: scans of the first for one of it."""
-    front = ranges(WAY, room(), LASER, 0.01, np.random.default_rng(0))
-    seen = [row for k, row in enumerate(front) for row in ([row, np.roll(row, 90)] if k % each == 0 else [row])]
-    poses = [pose for k, pose in enumerate(WAY) for pose in ([pose, pose] if k % each == 0 else [pose])]
-    for name, rows, at in (("one", front, WAY), ("two", seen, poses)):
-        scans = [
-            LaserScan(100.0 + 0.1 * k, frozen(row, np.float32), LASER, frozen(pose))
-            for k, (row, pose) in enumerate(zip(rows, at, strict=True))
-        ]
-        write_bag(tmp_path / f"{name}.mcap", scans)
-    assert open_source(tmp_path / "one.mcap").survey().scan_count == len(WAY)
-    with pytest.raises(
-        SourceError, match=r"the scans of /scan alternate between two views at .* on one topic; give each"
-    ):
-        open_source(tmp_path / "two.mcap").survey()
 
 
 def test_scans_of_a_covered_laser():

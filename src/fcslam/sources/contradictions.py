@@ -23,10 +23,6 @@ CHANGED = 0.6
 """Share of the beams that measure something else, if the scan changed."""
 FEWEST_RETURNS = 20
 """Scans with fewer common returns are not compared."""
-ALIKE = 0.3
-"""Largest share of the beams that measure something else in two scans of one place."""
-FEWEST_ALTERNATING, ALTERNATING = 10, 0.1
-"""Scans, and their share, between two that are alike and differ from it, of two lasers that publish on one topic."""
 
 
 class RepeatedScans:
@@ -43,29 +39,6 @@ class RepeatedScans:
             return False
         self._newest[scan.laser.T_base_laser] = scan
         return True
-
-
-class Alternation:
-    """Finds scans of two lasers that come as those of one: each is like the one before the last, unlike the last."""
-
-    def __init__(self) -> None:
-        self.count = self.alternating = 0
-        self._last_m: Ranges | None = None
-        self._before_other_m: Ranges | None = None
-        """The scan before the last, if the last one is unlike it."""
-
-    def add(self, ranges_m: Ranges) -> None:
-        """Add the next scan."""
-        self.count += 1
-        is_other = self._last_m is not None and changed_share(self._last_m, ranges_m) > CHANGED
-        if is_other and self._before_other_m is not None:
-            self.alternating += changed_share(self._before_other_m, ranges_m) < ALIKE
-        self._before_other_m, self._last_m = self._last_m if is_other else None, ranges_m
-
-    @property
-    def is_certain(self) -> bool:
-        """Whether one laser cannot have measured all scans."""
-        return self.alternating > max(FEWEST_ALTERNATING, ALTERNATING * self.count)
 
 
 class ScanWatch:

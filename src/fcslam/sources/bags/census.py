@@ -34,20 +34,11 @@ from fcslam.sources.bags.codec import (
     MessageCodec,
 )
 from fcslam.sources.bags.container import ZSTD, BagPart, Topic, check_order, open_parts
-from fcslam.sources.bags.messages import OdometryReading, ScanMessage, header_of, odometry_of, scan_of, transforms_of
+from fcslam.sources.bags.messages import header_of, odometry_of, scan_of, transforms_of
 from fcslam.sources.bags.records import MessagePlace, StoredMessage
 from fcslam.sources.bags.tape import Content, packed_content, unpacked_content
 from fcslam.sources.bags.transforms import Link, TransformTree, differ
 from fcslam.untrusted import unpack
-
-UNSET_SHARE: Final = 0.5
-"""Share of the messages that repeat the stamp of the one before if nobody sets it, or not its nanoseconds."""
-_STAMP_END: Final = 12
-"""Bytes of a message up to the end of its stamp, in ROS 1 and in ROS 2."""
-FEWEST_REPEATS: Final = 20
-"""Fewer repeated stamps say nothing."""
-SAME_TIME_NS: Final = 100_000
-"""Writers of bags put messages of one time in order by shorter steps."""
 
 _LATEST_NS: Final = 2**63 - 1
 """Of a damaged file, some times are larger."""
@@ -71,37 +62,6 @@ class Broken:
 
 
 @dataclass(slots=True)
-class Clock:
-    """Counts successive messages that have one stamp, but not the same content."""
-
-    changes: int = 0
-    """Messages that differ from the one before."""
-    repeats: int = 0
-    """Those with its stamp."""
-    recorded: int = 0
-    """Those of them that were recorded later than the one before."""
-    _before: tuple[float, int, object, object] = (0.0, 0, None, None)
-
-    def add(self, stamp: float, bag_time_ns: int, sensor: object, content: object) -> None:
-        """Add the next message; ``sensor`` says which of several made it."""
-        before, self._before = self._before, (stamp, bag_time_ns, sensor, content)
-        self.changes += before[3] != content
-        if (before[0], before[2]) == (stamp, sensor) and before[3] != content:
-            self.repeats += 1
-            self.recorded += bag_time_ns - before[1] > SAME_TIME_NS
-
-    @property
-    def is_unset(self) -> bool:
-        """Whether the stamps do not say when each message was made."""
-        return self.repeats > max(FEWEST_REPEATS, UNSET_SHARE * self.changes)
-
-    @property
-    def is_recorded(self) -> bool:
-        """Whether the times of recording say it."""
-        return 2 * self.recorded > self.repeats
-
-
-@dataclass(slots=True)
 class TopicCensus:
     """What the messages of a topic name, in the order of the files."""
 
@@ -114,8 +74,6 @@ class TopicCensus:
     """Frames of scans, or child frames of odometry, with their numbers of messages."""
     links: dict[Link, list[Transform]] = field(default_factory=dict)
     """Transforms of tf from a parent to a child: the first, and the first that differs from it."""
-    clocks: dict[Link, Clock] = field(default_factory=dict)
-    """Stamps of each transform of tf; of a topic of scans or odometry, by two empty names."""
     broken: Broken | None = None
 
     def add(self, time_ns: int) -> None:
@@ -127,43 +85,18 @@ class TopicCensus:
         """Convert an object of rosbags; None for a point cloud. Raises ValueError if it is invalid."""
         now_ns = message.time_ns
         if message.kind in SCANS:
-            stamp, frame = header_of(content.header, now_ns)
-            self.frames[frame] += 1
-            sensor = frame, getattr(content, "angle_min", 0.0)
-            self._clock(("", "")).add(stamp, now_ns, sensor, message.payload[_STAMP_END:])
+            self.frames[header_of(content.header, now_ns)[1]] += 1
             return scan_of(content, now_ns) if message.kind in LASER_SCANS else None
         if message.kind == ODOMETRY:
             reading = odometry_of(content, now_ns)
             self.frames[reading.base_frame] += 1
-            self._clock(("", "")).add(reading.stamp, now_ns, reading.base_frame, reading.T_odom_base)
             return reading
         transforms = list(transforms_of(content, now_ns))
-        for stamp, parent, child, transform in transforms:
-            self._clock((parent, child)).add(stamp, now_ns, "", transform)
+        for _, parent, child, transform in transforms:
             seen = self.links.setdefault((parent, child), [transform])
             if len(seen) == 1 and differ(seen[0], transform):
                 seen.append(transform)
         return transforms
-
-    def _clock(self, link: Link) -> Clock:
-        return self.clocks.setdefault(link, Clock())
-
-    def has_recorded_clock(self, link: Link = ("", "")) -> bool:
-        """Whether the times of recording count, as nobody sets the stamps."""
-        clock = self.clocks.get(link)
-        return clock is not None and clock.is_unset and clock.is_recorded
-
-    def stamped(self, time_ns: int, content: Content) -> Content:
-        """A message with its time of recording as its stamp, if nobody sets that."""
-        stamp = time_ns / 10**9
-        if isinstance(content, ScanMessage | OdometryReading):
-            return content._replace(stamp=stamp) if self.has_recorded_clock() else content
-        if isinstance(content, list):
-            return [
-                each._replace(stamp=stamp) if self.has_recorded_clock((each.parent, each.child)) else each
-                for each in content
-            ]
-        return content
 
 
 class BagMessage(NamedTuple):
@@ -250,23 +183,17 @@ class DecodedBag:
                     decoded: Any
                     if topic.type in _KEPT:
                         _, offset, size = place
-                        decoded = census[topic].stamped(time_ns, unpacked_content(os.pread(tape, size, offset)))
+                        decoded = unpacked_content(os.pread(tape, size, offset))
                     else:
                         with parts[at].translated():
                             if at not in payloads:
                                 payloads[at] = opened.enter_context(parts[at].file.reading())
                             payload = payloads[at](MessagePlace(*place))
-                        decoded = self._decoded(topic, payload, parts[at].file.ros1)
+                        try:
+                            decoded = _decode(payload, topic.type, parts[at].file.ros1)
+                        except ValueError as error:
+                            decoded = error
                     yield BagMessage(topic, counts[topic], time_ns, decoded)
-
-    def _decoded(self, topic: Topic, payload: bytes, ros1: bool) -> Any:
-        try:
-            content = _decode(payload, topic.type, ros1)
-            if self.census[topic].has_recorded_clock():
-                content.header.stamp.sec = content.header.stamp.nanosec = 0
-        except ValueError as error:
-            return error
-        return content
 
     @cached_property
     def _index(self) -> _Index:

@@ -1,6 +1,6 @@
 """Decides once, before a bag is read, which of its topics and frames are read, and how."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from itertools import chain, islice
 from math import degrees, tau
@@ -12,7 +12,7 @@ from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.records import Sweep
 from fcslam.sources.bags.camera import Calibration, ImageMessage, image_of
-from fcslam.sources.bags.census import BagMessage, Clock
+from fcslam.sources.bags.census import BagMessage
 from fcslam.sources.bags.cloud_scans import BagScans, calibration_in, valid
 from fcslam.sources.bags.codec import LASER_SCANS, ODOMETRY, SCANS
 from fcslam.sources.bags.container import Topic
@@ -104,8 +104,6 @@ class BagPlan(NamedTuple):
     """The chosen topic, else tf; one that says nothing is none."""
     odometry_ahead_s: float
     """The clock of the odometry against that of the scans."""
-    clocks: Mapping[str, Clock]
-    """The stamps of the lasers and of the odometry, by the names of these."""
     calibration: Calibration | None
     """Of the camera; None without a camera or a readable calibration."""
     odometry_notes: tuple[str, ...]
@@ -167,14 +165,9 @@ class _Planner:
         )
         odometry = self._odometry(lasers[0].first.frame)
         ahead_s = 0.0 if odometry is None else self._clock_ahead_s(odometry)
-        read = [(topic.name, topic, ("", "")) for topic in topics.scans]
-        if odometry is not None:
-            read += [(odometry.name, topic, odometry.edge or ("", "")) for topic in odometry.topics]
-        counted = {topic: its.clocks for topic, its in self._bag.census.items()}
-        clocks = {name: counted[topic][link] for name, topic, link in read if link in counted[topic]}
         calibration = calibration_in(self._robot, topics.camera_info)
         notes = tuple(self._notes)
-        return BagPlan(topics, self._tree, self._scans, lasers, odometry, ahead_s, clocks, calibration, notes)
+        return BagPlan(topics, self._tree, self._scans, lasers, odometry, ahead_s, calibration, notes)
 
     def _laser(self, topic: Topic, frame: str | None) -> RecordedLaser:
         own = (scan for scan in self._scans.of(topic) if frame in (None, scan.frame))

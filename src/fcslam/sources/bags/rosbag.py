@@ -35,7 +35,7 @@ from fcslam.sources.bags.rig import (
 )
 from fcslam.sources.bags.robots import BagRobot, robot_of, robots_of, slashed
 from fcslam.sources.bags.transforms import USUAL_BASES, Mounting
-from fcslam.sources.contradictions import Alternation, ScanWatch
+from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.path_summary import PathSummary, check_units
@@ -195,7 +195,6 @@ class RosBag:
         scans, odometry = PathSummary(), PathSummary()
         samples = [RangeSample() for _ in lasers]
         bodies = [BodySample() for _ in lasers]
-        alternations = [Alternation() for _ in lasers]
         farthest_m = [laser.first.range_max_m for laser in lasers]
         base_frame = self._options.base_frame or ""
         self._count_broken_transforms(audit, errors)
@@ -203,7 +202,6 @@ class RosBag:
             if isinstance(entry, PosedScan):
                 laser = entry.scan.laser
                 farthest_m[laser] = max(farthest_m[laser], entry.scan.range_max_m)
-                alternations[laser].add(entry.scan.raw_ranges_m)
                 if lasers[laser].topic.type not in LASER_SCANS:
                     bodies[laser].add(entry.T_odom_base, entry.scan.beams, entry.scan.raw_ranges_m)
                 if (sample := samples[laser]).wants(entry.T_odom_base):
@@ -213,13 +211,6 @@ class RosBag:
             elif isinstance(entry, OdometryReading):
                 odometry.add(entry.stamp, entry.T_odom_base)
                 base_frame = base_frame or entry.base_frame
-        for recorded, found in zip(lasers, alternations, strict=True):
-            if found.is_certain:
-                raise SourceError(
-                    f"{self.path}: the scans of {recorded.name} alternate between two views at "
-                    f"{found.alternating} of {found.count} scans, as of two lasers or robots publishing on one topic; "
-                    "give each robot its own namespace, and each laser its own topic or frame, and record again"
-                )
         self._refuse(audit.faults(), scans, odometry, errors)
         which = [f" of {laser.name}" for laser in lasers]
         for sample, its, recorded in zip(samples, which, lasers, strict=True):
@@ -264,7 +255,6 @@ class RosBag:
             *self.robot.notes,
             *plan.topics.notes,
             *plan.odometry_notes,
-            *self._clock_notes(),
             *tilts,
             *several_parents,
             *camera_notes,
@@ -285,15 +275,6 @@ class RosBag:
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary, errors: Mapping[str, str]) -> None:
         path, topics, (laser, *_) = self.path, self.plan.topics, self.plan.lasers
-        clocks = self.plan.clocks
-        lost = [(name, clock) for name, clock in clocks.items() if clock.is_unset and not clock.is_recorded]
-        if 0 < len(lost) < len(clocks):  # all with the same stamps keep their order
-            name, clock = lost[0]
-            raise SourceError(
-                f"{path}: {clock.repeats} messages of {name} repeat the stamp of the one before, and "
-                "its time of recording, so nothing says when they were made; let the driver set the stamps, with their "
-                "nanoseconds, and record again"
-            )
         check_consistency(path, faults, scans.count, odometry.count, _in_brackets(errors))
         alone = faults[Fault.NO_ODOMETRY].count
         if alone > scans.count:
@@ -305,14 +286,6 @@ class RosBag:
                 "odom-topic=none"
             )
         check_units(path, scans)
-
-    def _clock_notes(self) -> list[str]:
-        return [
-            f"{self.path}: {clock.repeats} messages of {name} repeat the stamp of the one "
-            "before, so their times of recording are used; let the driver set the stamps, with their nanoseconds"
-            for name, clock in self.plan.clocks.items()
-            if clock.is_unset and clock.is_recorded
-        ]
 
     def _mountings(self, base_frame: str, errors: Mapping[str, str]) -> list[Mounting]:
         lasers, poses = self.plan.lasers, self._options.laser_poses

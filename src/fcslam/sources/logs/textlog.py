@@ -19,7 +19,7 @@ import numpy as np
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
-from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, Ranges, SensorRecord, frozen
+from fcslam.records import Beams, FloatArray, LaserScan, Odometry, Ranges, SensorRecord, frozen
 from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, check_consistency, scan_window
@@ -54,10 +54,6 @@ _WORDS_NAMED, _LONGEST_WORD = 5, 20
 _LONGEST_RANGE_M = 1e6
 UNTIMED_STEP_S = 1.0
 """Time between the scans of a log that states none."""
-FULL_TURN_RAD = 6.0
-"""A scanner whose beams span more measures a full turn."""
-SPINNING_HZ = 4.0, 20.0
-"""Turns a second of scanners that spin, and log every turn."""
 
 
 class _Reading(NamedTuple):
@@ -156,7 +152,6 @@ class TextLog:
         check_units(path, driven)
         laser = laser_model(telling, parameters, mounting)
         notes = [f"the odometry {driven.fault}; it is not used", WITHOUT_ODOMETRY] if driven.fault else []
-        notes += _spinning(laser, scans)
         placeholders = sample.placeholders()
         survey = Survey(
             scans.count,
@@ -249,17 +244,6 @@ class TextLog:
                     late = latest if reading.pose_from_odometry else None
                     pose = (late or line).T_odom_base if reading.has_odometry else UNKNOWN_POSE
                     yield number, _Scan(line, beams, pose)
-
-
-def _spinning(laser: LaserModel, scans: PathSummary) -> list[str]:
-    """A note about a scanner that probably spins, as a log does not say when each beam was measured."""
-    rate_hz = (scans.count - 1) / scans.duration_s if scans.duration_s > 0.0 else 0.0
-    if laser.beams.span_rad < FULL_TURN_RAD or not SPINNING_HZ[0] <= rate_hz <= SPINNING_HZ[1]:
-        return []
-    return [
-        f"{rate_hz:.1f} scans a second of a full turn, and no times of beams; if the scanner spins, set "
-        f"robot.lidar.scan_duration_s: {1.0 / rate_hz:.3f}"
-    ]
 
 
 def _note_clock(number: int, line: ScanLine, audit: Audit) -> None:
