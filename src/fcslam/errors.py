@@ -4,7 +4,6 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 _SYSTEM_ERROR = re.compile(r"\[Errno -?\d+\] ([^:()]+)(?:: '([^']*)')?")
 """How Python writes an error of the operating system: its number, its text, and often the file."""
@@ -20,18 +19,10 @@ class FcslamError(Exception):
     def __init__(self, message: str) -> None:
         super().__init__(_SYSTEM_ERROR.sub(lambda found: _readable(found, message), message))
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """With all attributes, whatever the arguments of the class are: errors cross processes."""
-        return _restored, (type(self), str(self)), vars(self)
-
 
 @contextmanager
 def writing(path: Path, advice: str = "free disk space and run the same command again") -> Iterator[None]:
-    """Report an error of the operating system in this block as one of writing ``path``; ``advice``: what to do then.
-
-    Raises:
-        InputError: the block cannot write.
-    """
+    """Report an error of the operating system in this block as one of writing ``path``; ``advice``: what to do then."""
     try:
         yield
     except OSError as error:
@@ -46,12 +37,6 @@ def printable(text: str) -> str:
 def _readable(system_error: re.Match[str], message: str) -> str:
     text, file = system_error.groups()
     return text if file is None or message.startswith(file) else f"{text}: '{file}'"
-
-
-def _restored(kind: type[FcslamError], message: str) -> FcslamError:
-    error = kind.__new__(kind)
-    error.args = (message,)
-    return error
 
 
 class InputError(FcslamError):
@@ -94,7 +79,7 @@ class PacketError(FcslamError):
 class PacketConflictError(PacketError):
     """A packet has the number of a different packet that is already stored."""
 
-    def __init__(self, message: str, index: int) -> None:
+    def __init__(self, message: str, index: int = 0) -> None:
         super().__init__(message)
         self.index = index
         """Index of the packet in its batch."""

@@ -187,49 +187,6 @@ class Stream(Generic[Item]):
         self._receiving.close()
 
 
-class RecurringTask:
-    """A task that runs beside this process again and again, for at most a share of the time."""
-
-    def __init__(self, start: Start, clock: Callable[[], float], share: float, every_s: float) -> None:
-        """``every_s``: least time between the end of one run and the beginning of the next."""
-        self._start, self._clock, self._share, self._every_s = start, clock, share, every_s
-        self._running: Background | None = None
-        self._began_s = clock()
-        self.due_s = self._began_s
-        """When the next run may begin, by the clock."""
-
-    @property
-    def is_running(self) -> bool:
-        """Whether a run has begun and ``end`` has not said that it ended."""
-        return self._running is not None
-
-    @property
-    def is_due(self) -> bool:
-        """Whether a run may begin now."""
-        return self._running is None and self._clock() >= self.due_s
-
-    def begin(self, task: Callable[[], None]) -> None:
-        """Begin a run."""
-        self._began_s = self._clock()
-        self._running = self._start(task)
-
-    def end(self) -> int | None:
-        """The exit code of a run that has ended since the last call; None: none has."""
-        if self._running is None or self._running.exitcode is None:
-            return None
-        exitcode, self._running = self._running.exitcode, None
-        now = self._clock()
-        self.due_s = now + max((now - self._began_s) * (1.0 / self._share - 1.0), self._every_s)
-        return exitcode
-
-    def stop(self) -> None:
-        """End a run that goes on."""
-        if self._running is not None:
-            self._running.terminate()
-            self._running.join()
-            self._running = None
-
-
 def keep_memory_trimmed() -> None:
     """Let this process give freed memory back to the system at once, also between memory in use.
 

@@ -56,19 +56,8 @@ from fcslam.wire.quantisation import dequantise, rounded
 
 _EMPTY_SCAN = PointScan(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), np.zeros(2))
 _LASER = LaserModel(240, -np.pi, 2.0 * np.pi / 240, 20.0)
-_WALLS = np.array(
-    [
-        (0.0, 0.0, 16.0, 0.0),
-        (16.0, 0.0, 16.0, 9.0),
-        (16.0, 9.0, 0.0, 9.0),
-        (0.0, 9.0, 0.0, 0.0),
-        (4.0, 0.0, 4.0, 1.5),
-        (7.0, 9.0, 8.5, 7.0),
-        (12.0, 0.0, 12.5, 2.0),
-        (13.0, 6.5, 16.0, 6.0),
-    ]
-)
-"""x, y of both ends, metres, in a made-up room."""
+_ROOM = np.array([(1.0, 0.0, 16.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 9.0), (0.0, -1.0, 0.0), (0.8, 0.6, 15.2)])
+"""Walls of a made-up room without symmetry: x and y of the normal, and the distance from the origin, metres."""
 _ROUND = 60
 """Made-up scans of one round through the room."""
 _STEPS = 30
@@ -119,8 +108,8 @@ def warm_up_tracking(config: RobotConfig) -> None:
     scans = list(made_up_scans(_STEPS, sweep=Sweep(0.0, 0.1)))
     for scan in scans:
         frontend.process(scan)
-    similar_room = 0.95 * _WALLS  # a scan of one is near surfaces of the other
-    is_lost(list(made_up_scans(FEWEST_SCANS, similar_room, Sweep(0.0, 0.1))), frontend)
+    # In a room of nearly the same size, a scan is near surfaces of the other one.
+    is_lost(list(made_up_scans(FEWEST_SCANS, 0.95, Sweep(0.0, 0.1))), frontend)
     point_scan(scans[0].ranges_m, scans[0].laser)  # of a laser that states no beam times
     gc.collect()
     gc.freeze()
@@ -193,7 +182,7 @@ def _bodies(robot: str) -> Iterator[Body]:
     poses = np.column_stack((2.0 + 0.4 * np.arange(_STEPS), np.full(_STEPS, 4.0), np.zeros(_STEPS)))
     yield Hello(robot, 0, (_LASER,), dict.fromkeys(PLACE_CHANNELS, "made-up-1"))
     for k, pose in enumerate(poses):
-        yield Keyscan(KeyscanId(robot, k), float(k), made_up_ranges(pose))
+        yield Keyscan(KeyscanId(robot, k), float(k), _ranges(pose))
         if k:
             yield _constraint(robot, poses, k - 1, k, ConstraintKind.ODOMETRY)
         if k >= 6 and k % 3 == 0:
@@ -209,27 +198,20 @@ def _constraint(robot: str, poses: FloatArray, i: int, j: int, kind: ConstraintK
     return Constraint(robot, i, j, kind, frozen(se2.between(poses[i], poses[j])), frozen(np.diag((1e4, 1e4, 1e5))))
 
 
-def made_up_scans(count: int, walls: FloatArray = _WALLS, sweep: Sweep | None = None) -> Iterator[LaserScan]:
-    """Scans of a robot that drives around in a room with ``walls``, shape (W, 4), about 0.5 m at a time."""
+def made_up_scans(count: int, scale: float = 1.0, sweep: Sweep | None = None) -> Iterator[LaserScan]:
+    """Scans of a robot that drives around in a room, ``scale`` times its size, about 0.5 m at a time."""
     turn = 2.0 * np.pi / _ROUND
     for k in range(count):
         x, y = 8.0 + 5.0 * np.cos(k * turn), 4.5 + 2.0 * np.sin(k * turn)
         heading = float(np.arctan2(2.0 * np.cos(k * turn), -5.0 * np.sin(k * turn)))
         pose = np.array((x, y, heading))
-        yield LaserScan(float(k), made_up_ranges(pose, walls), _LASER, frozen(pose), sweep)
+        yield LaserScan(float(k), _ranges(pose, scale), _LASER, frozen(pose), sweep)
 
 
-def made_up_ranges(pose: FloatArray, walls: FloatArray = _WALLS) -> Ranges:
+def _ranges(pose: FloatArray, scale: float = 1.0) -> Ranges:
     """Distance to the nearest wall along every beam, as it is sent, shape (B,)."""
     angles = pose[2] + _LASER.angles_rad()
-    beams = np.stack((np.cos(angles), np.sin(angles)), axis=-1)[:, np.newaxis]
-    starts, along = walls[:, :2] - pose[:2], walls[:, 2:] - walls[:, :2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        facing = _cross(beams, along)
-        distance, share = _cross(starts, along) / facing, _cross(starts, beams) / facing
-    hit = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
-    return rounded(np.where(hit, distance, np.inf).min(axis=1), _LASER.max_range_m)
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+    facing = _ROOM[:, :2] @ (np.cos(angles), np.sin(angles))
+    gaps_m = scale * _ROOM[:, 2:] - _ROOM[:, :2] @ pose[:2, None]
+    distances_m = np.divide(gaps_m, facing, out=np.full_like(facing, np.inf), where=facing > 0.0)
+    return rounded(distances_m.min(axis=0), _LASER.max_range_m)

@@ -37,7 +37,7 @@ def no_password(monkeypatch):
     ("url", "says"),
     [
         (f"mysql://me:{WRONG}@127.0.0.1/x", "write postgresql://USER@HOST:PORT/DATABASE"),
-        (f"postgresql://me:{WRONG}@127.0.0.1:port/x", "write postgresql://USER@HOST:PORT/DATABASE"),
+        (f"postgresql://me:{WRONG}@127.0.0.1:port/x", 'invalid integer value "port"'),
         ("data/missions.db", "write postgresql://USER@HOST:PORT/DATABASE"),
     ],
 )

@@ -112,7 +112,7 @@ def test_a_map_that_the_cloud_draws_anew_meanwhile_is_read_again(floors, tmp_pat
         return [replaced(one) for one in answers[-1]] if is_old else answers[-1]
 
     def replaced(one):
-        return one._replace(extent_m=(one.extent_m[0] - 0.05, *one.extent_m[1:]))
+        return one.model_copy(update={"extent_m": (one.extent_m[0] - 0.05, *one.extent_m[1:])})
 
     monkeypatch.setattr(MapClient, "maps", maps)
     assert fetch_maps(tmp_path / "copy", Server(floors)) is None

@@ -34,7 +34,7 @@ from fcslam.service.shared.mission_tables import Lease, prepare
 from fcslam.service.shared.missions import SharedMissions
 from fcslam.service.shared.registry import KnownMission
 from fcslam.service.supervisor import RunningWorker, StandbyWorkers, Supervisor, WorkerTask, start_worker
-from fcslam.storage.postgres import Postgres, is_server, take_password
+from fcslam.storage.postgres import Postgres, take_password
 from fcslam.wire.http_transport import is_loopback
 
 _log = logging.getLogger("fcslam.service")
@@ -75,7 +75,7 @@ def shared_state(
     name, limit = f"{socket.gethostname()[:58]}-{port}", os.environ.get("FCSLAM_MAX_MISSIONS") or "20"
     if not limit.isdecimal():
         raise InputError(f"FCSLAM_MAX_MISSIONS={limit}: is not a number from 0 on")
-    if not is_server(store):
+    if not store.startswith(("postgresql://", "postgres://")):
         raise InputError("--store: not the address of a database; write postgresql://USER@HOST:PORT/DATABASE")
     url = take_password(store)
     with ExitStack() as opened:

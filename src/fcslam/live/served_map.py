@@ -11,7 +11,8 @@ from fcslam.maps.occupancy_map import area_of, map_stem, parse_map
 from fcslam.records import FloatArray, frozen
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.folder import is_run_folder
-from fcslam.wire.fleet_client import MapClient, ServedMap
+from fcslam.wire.fleet_client import MapClient
+from fcslam.wire.fleet_replies import ServedMap
 from fcslam.wire.http_transport import Server, addresses
 from fcslam.wire.keys import Credentials
 
@@ -44,7 +45,7 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
 
 def _read(client: MapClient, server: str) -> Run:
     for _ in range(_ATTEMPTS):
-        served = [one for one in client.maps() if one.extent_m]
+        served = [one for one in client.maps() if one.extent_m is not None]
         if not served:
             raise SourceError(f"{server}: has no map yet; let a robot send its scans first")
         files = {
@@ -70,7 +71,7 @@ def _fits(served: ServedMap, files: dict[str, bytes], server: str) -> bool:
     image, description = files[f"{stem}.pgm"], files[f"{stem}.yaml"].decode("utf-8", errors="replace")
     try:
         area = area_of(stem, image, description)
-        if not np.allclose(area.extent_m, served.extent_m, rtol=0.0, atol=1e-6):
+        if not np.allclose(area.extent_m, served.extent_m or (), rtol=0.0, atol=1e-6):
             return False
         parse_map(stem, image, description)
     except InputError as error:

@@ -43,7 +43,7 @@ from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.mission_store import CONFIG, Envelope, Finalization, MissionStore, StoredPacket
-from fcslam.processes import RecurringTask, Start, emit_event, start_copy, trim_memory
+from fcslam.processes import Background, Start, emit_event, start_copy, trim_memory
 from fcslam.runs import QUALITY, Metric, Run
 from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
@@ -100,7 +100,7 @@ class Worker:
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
         self._folder, self._store, self._clock, self._emit_event = folder, store, clock, emit_event
-        self._share = share
+        self._start, self._share = start, share
         self._crashes = CrashLog(folder.worker_task)
         self._ready: deque[StoredPacket] = deque()
         """Packets that may take effect and did not yet."""
@@ -113,10 +113,10 @@ class Worker:
         """How many packets took effect before a restart: their results are stored already."""
         self._times: dict[tuple[str, int], float] = {}
         """Newest time of each session."""
-        joint_task = RecurringTask(start, clock, share=0.5, every_s=0.5)
-        live_task = RecurringTask(start, clock, share=0.1, every_s=1.0)
-        self._joint_maps = _Output("the joint maps", JOINT, folder.joint_maps, joint_task, self._joint_maps_writer)
-        self._live = _Output("the live map", LIVE, folder.live, live_task, self._live_writer)
+        joint = "the joint maps", JOINT, folder.joint_maps
+        self._joint_maps = _Output(*joint, share=0.5, every_s=0.5, writer=self._joint_maps_writer)
+        live = "the live map", LIVE, folder.live
+        self._live = _Output(*live, share=0.1, every_s=1.0, writer=self._live_writer)
         self._outputs = self._joint_maps, self._live
         self._certified, self._certify_at = dict[str, int](), -math.inf
         """The map of each session as the certificate of the live run folder was computed, and when it is due again."""
@@ -145,10 +145,10 @@ class Worker:
         """How long there is nothing to do unless something comes in."""
         now, waits_s = self._clock(), [1.0]
         for output in self._outputs:
-            if output.task.is_running:
+            if output.copy is not None:
                 waits_s.append(0.05)
             elif output.shown < self._applied:
-                waits_s.append(output.task.due_s - now)
+                waits_s.append(output.due_s - now)
         if self._reported < self._applied:
             waits_s.append(self._report_at - now)
         return max(min(waits_s), 0.0)
@@ -166,7 +166,7 @@ class Worker:
             self._times.clear()
             self._emit_event(PROGRESS, 0)
         self._joint_maps.shown = self._live.shown = -1
-        self._live.task.due_s = self._clock()  # who edits the map waits for it
+        self._live.due_s = self._clock()  # who edits the map waits for it
         self._reported = min(self._reported, max(self._applied, self._resumed_at) - 1)
         return True
 
@@ -354,23 +354,25 @@ class Worker:
 
     def _write(self, output: "_Output") -> bool:
         """Write an output in a copy of this process, if something is new and the last time is long enough ago."""
-        exitcode = output.task.end()
-        if exitcode is not None:
-            return self._end_writing(output, exitcode)
+        if output.copy is not None:
+            exitcode = output.copy.exitcode
+            return exitcode is not None and self._end_writing(output, exitcode)
         is_new = output.shown != self._applied and self._applied >= self._resumed_at
-        if not is_new or not output.task.is_due:
+        if not is_new or self._clock() < output.due_s:
             return False
         try:
             if self._host.fleet.read_ahead(AT_ONCE):  # after a restart, in small steps
                 return True
             write = output.writer()
-            output.task.begin(lambda: _written(output.name, write))
+            output.began_s, output.copy = self._clock(), self._start(lambda: _written(output.name, write))
         except Exception as error:  # packets matter more, and there may be memory later
             return self._postpone(output, f"{type(error).__name__}: {error}")
         output.shown = output.begun = self._applied
         return True
 
     def _end_writing(self, output: "_Output", exitcode: int) -> bool:
+        now, output.copy = self._clock(), None
+        output.due_s = now + max((now - output.began_s) * (1.0 / output.share - 1.0), output.every_s)
         if exitcode:  # packets matter more, and the disk may be freed
             return self._postpone(output, f"the writer ended with code {exitcode}")
         try:
@@ -383,7 +385,7 @@ class Worker:
 
     def _postpone(self, output: "_Output", reason: str) -> bool:
         _log.error("%s will be written later: %s", output.name, reason)
-        output.shown, output.task.due_s = -1, self._clock() + PAUSE_S
+        output.shown, output.due_s = -1, self._clock() + PAUSE_S
         return False
 
     def _joint_maps_writer(self) -> Callable[[], None]:
@@ -467,13 +469,21 @@ class _Output:
     name: str
     shared_as: str
     place: Path
-    task: RecurringTask
+    share: float
+    """Largest share of the time for writing."""
+    every_s: float
+    """Least time between the end of one copy and the beginning of the next."""
     writer: Callable[[], Callable[[], None]]
     """Gives what writes the output as it is now."""
     shown: int = -1
     """How many packets it shows, or will when it is written; -1: it is to be written anew."""
     begun: int = -1
     """How many packets the newest copy writes."""
+    copy: Background | None = None
+    """The copy that writes it now."""
+    began_s: float = -math.inf
+    due_s: float = -math.inf
+    """When the newest copy began, and when the next one may begin."""
 
 
 def _number(packet: StoredPacket | Envelope) -> PacketNumber:

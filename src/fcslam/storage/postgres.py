@@ -28,7 +28,6 @@ ANSWER_S: Final = 10.0
 """A statement that takes longer fails: the server, or the way to it, is gone."""
 MOST_CONNECTIONS: Final = 8
 """Most connections of one process to the server."""
-_SCHEMES: Final = ("postgresql", "postgres")
 _MARK: Final = re.compile(r"\?|:([a-z_]+)")
 
 
@@ -189,15 +188,6 @@ class PostgresTransaction:
             cursor.itersize = 1000
             cursor.execute(statement)
             yield from cursor
-
-
-def is_server(store: str) -> bool:
-    """Whether the name of a store has the form of a PostgreSQL server's address."""
-    try:
-        parts = urlsplit(store)
-        return parts.scheme in _SCHEMES and parts.port != 0
-    except ValueError:  # of the port
-        return False
 
 
 def take_password(url: str) -> str:

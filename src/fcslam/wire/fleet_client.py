@@ -1,18 +1,19 @@
 """HTTP clients of a robot that follows its fleet (the joint map in tiles, all robots), or reads the maps of a cloud."""
 
 import json
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from pydantic import TypeAdapter
 
-from fcslam.wire.fleet_replies import FleetReply, MapFrontiers, QualityReply
+from fcslam.wire.fleet_replies import FleetReply, MapFrontiers, QualityReply, ServedMap
 from fcslam.wire.http_transport import HttpClient
 
 if TYPE_CHECKING:
     import httpx
 
 _FRONTIERS, _QUALITY = TypeAdapter(tuple[MapFrontiers, ...]), TypeAdapter(tuple[QualityReply, ...])
+_MAPS = TypeAdapter(tuple[ServedMap, ...])
 
 
 class FleetClient(HttpClient):
@@ -62,17 +63,6 @@ class FleetClient(HttpClient):
         return response.content, response.headers.get("ETag", "")
 
 
-class ServedMap(NamedTuple):
-    """One of the maps of a cloud."""
-
-    number: int
-    floor: str
-    """Floor of its robots; empty: none."""
-    robots: tuple[str, ...]
-    extent_m: tuple[float, ...]
-    """Lowest x and y, highest x and y, metres; empty before there is a map."""
-
-
 class MapClient(HttpClient):
     """Reads the maps of one cloud; it needs the rights of a viewer. Each method raises as ``HttpTransport.state``."""
 
@@ -80,15 +70,7 @@ class MapClient(HttpClient):
         """The maps of the cloud now."""
         response = self._ask("GET", "maps")
         with self._reading():
-            return [
-                ServedMap(
-                    int(one["map"]),
-                    str(one["floor"]),
-                    tuple(map(str, one["robots"])),
-                    tuple(map(float, one["extent"] or ())),
-                )
-                for one in response.json()
-            ]
+            return list(_MAPS.validate_json(response.content))
 
     def image(self, number: int) -> bytes:
         """The PGM file of a map."""

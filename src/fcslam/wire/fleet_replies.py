@@ -74,3 +74,14 @@ class QualityReply(_Reply):
     )
     good_share: float | None = Field(description="share of good cells")
     drives: tuple[str, ...] = Field(description="what to drive again, that with the largest gain first")
+
+
+class ServedMap(_Reply):
+    """One of the maps of a cloud."""
+
+    number: int = Field(alias="map")
+    floor: str = Field(description="floor of its robots; empty: none")
+    robots: tuple[str, ...]
+    extent_m: tuple[float, ...] | None = Field(
+        alias="extent", description="lowest x and y, highest x and y, metres; null before there is a map"
+    )
