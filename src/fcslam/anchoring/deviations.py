@@ -18,7 +18,7 @@ from fcslam.records import FloatArray
 
 OFF_M: Final = 0.10
 """A wall that is off by less stands where the plan has it."""
-AWAY_M: Final = 0.30
+AWAY_M: Final = 3.0 * OFF_M
 """A surface farther than this from any surface of the other map is not in that map."""
 SHORTEST_M: Final = 1.5
 """Shortest wall that is missing or moved: shorter lines of a plan are furniture and doors."""

@@ -39,7 +39,7 @@ WITHIN_M: Final = 10.0
 CELL_M: Final = 1.0
 MOST_PLACES: Final = 600
 """Places whose covariances are computed; of a larger map they lie farther apart."""
-SEEN_FROM_M: Final = 5.0
+SEEN_FROM_M: Final = 0.5 * WITHIN_M
 """A pass counts for the cells up to this distance."""
 PASS_GAP_S: Final = 20.0
 """Two scans of one robot with a longer gap between them are two passes."""
@@ -48,7 +48,7 @@ OPEN_M: Final = 0.03
 OPEN_LENGTH_M: Final = 3.0
 """Shorter open stretches are not named."""
 AGAIN_M: Final = 0.01
-AGAIN_PER_M: Final = 0.001
+AGAIN_PER_M: Final = 0.1 * AGAIN_M
 """Standard deviation of the motion that another drive between two places measures: constant, and by metre."""
 UNKNOWN_INFORMATION: Final = 1e-4
 """Information about the pose of keyscans that no edge connects with the first one."""

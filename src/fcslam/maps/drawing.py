@@ -6,7 +6,7 @@ Drawn with OpenCV, which takes a sixth of the time of matplotlib and does not in
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -22,14 +22,14 @@ Color = tuple[int, int, int]
 
 LONG_SIDE_PX: Final = 1600
 MARGIN_PX: Final = 40
-NARROWEST_PX: Final = 640
+NARROWEST_PX: Final = 16 * MARGIN_PX
 """Smallest width of the picture, which the legend needs."""
 RAY_M: Final = 0.15
 """Known area thinner than this, such as single beams through windows, does not extend the picture."""
 FARTHEST_PX: Final = 100_000.0
 """Pixel coordinates are clipped to this, because OpenCV's fixed-point coordinates overflow beyond."""
 
-LINE_HEIGHT_PX: Final = 40
+LINE_HEIGHT_PX: Final = MARGIN_PX
 SWATCH_PX: Final = 34
 GAP_PX: Final = 14
 FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
@@ -38,22 +38,11 @@ CLOSURES_APART_M: Final = 1.5
 """Smallest distance between the midpoints of two drawn closures."""
 SUBPIXEL_BITS: Final = 4
 """Fractional bits of OpenCV's fixed-point coordinates."""
-SIDE_PX: Final = 480
+SIDE_PX: Final = 12 * MARGIN_PX
 """Side of the picture of a closure."""
 REACH_M: Final = 15.0
 """Half of its side, or more for keyscans that are far apart: this remains around each."""
 DOT_PX: Final = 2
-
-
-class DrawnClosure(NamedTuple):
-    """A loop closure for the picture: positions of both ends in ``map``."""
-
-    xy_a: FloatArray
-    """Shape (2,), metres."""
-    xy_b: FloatArray
-    """Shape (2,), metres."""
-    robot_a: str
-    robot_b: str
 
 
 def _bgr(rgb: int) -> Color:
@@ -86,26 +75,25 @@ class _Viewport:
         return np.asarray(np.clip(np.stack((column, row), axis=-1), -FARTHEST_PX, FARTHEST_PX))
 
 
-def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closures: Sequence[DrawnClosure]) -> bytes:
+def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closures: Sequence[FloatArray] = ()) -> bytes:
     """Draw the map as a PNG of about 1600 pixels on its long side, cropped to known area and trajectories.
 
-    Each trajectory has shape (N, 2+) in ``map`` and a dot at the first pose. Closures between two robots are counted,
-    and drawn unless they are too close together.
+    Each trajectory has shape (N, 2+) in ``map`` and a dot at the first pose. Closures between robots, given by their
+    ends (2, 2) in ``map``, are counted, and drawn unless they are too close together.
     """
     view = _view(fused, trajectories.values())
     canvas = _canvas(view)
     colors = {robot: _bgr(color) for robot, color in palette.robot_colors(trajectories).items()}
     ways = [(view.pixels(points), colors[robot]) for robot, points in trajectories.items()]
-    shared = [closure for closure in closures if closure.robot_a != closure.robot_b]
     for pixels, color in ways:
         _draw_trajectory(canvas, pixels, color)
-    for closure in _spread(shared):
-        _draw_line(canvas, view.pixels(np.array((closure.xy_a, closure.xy_b))), CLOSURE, 1)
+    for ends in _spread(closures):
+        _draw_line(canvas, view.pixels(ends), CLOSURE, 1)
     for pixels, color in ways:
         _draw_start(canvas, pixels, color)
     labels = list(colors.items())
-    if shared:
-        labels.append((f"{len(shared)} closure{'s' * (len(shared) > 1)} between robots", CLOSURE))
+    if closures:
+        labels.append((f"{len(closures)} closure{'s' * (len(closures) > 1)} between robots", CLOSURE))
     picture = np.vstack((canvas, _legend(labels, canvas.shape[1], view.cell_px / view.cell_m)))
     return bytes(cv2.imencode(".png", picture)[1])
 
@@ -130,21 +118,21 @@ def highlighted_png(
     return bytes(cv2.imencode(".png", picture)[1])
 
 
-def _spread(closures: Sequence[DrawnClosure]) -> list[DrawnClosure]:
+def _spread(closures: Sequence[FloatArray]) -> list[FloatArray]:
     """Select the shortest closures with at least ``CLOSURES_APART_M`` between their midpoints.
 
     A closure is compared with those in the squares around its midpoint, so that many take no longer each than few.
     """
     side_m = CLOSURES_APART_M
-    drawn: list[DrawnClosure] = []
+    drawn: list[FloatArray] = []
     squares: dict[tuple[int, int], list[tuple[float, float]]] = {}
-    finite = [closure for closure in closures if np.isfinite((closure.xy_a, closure.xy_b)).all()]
-    for closure in sorted(finite, key=lambda m: float(np.hypot(*(m.xy_b - m.xy_a)))):
-        x, y = ((closure.xy_a + closure.xy_b) / 2.0).tolist()
+    finite = [ends for ends in closures if np.isfinite(ends).all()]
+    for ends in sorted(finite, key=lambda ends: float(np.hypot(*(ends[1] - ends[0])))):
+        x, y = ((ends[0] + ends[1]) / 2.0).tolist()
         column, row = int(x // side_m), int(y // side_m)
         around = ((column + i, row + j) for i in (-1, 0, 1) for j in (-1, 0, 1))
         if all(math.dist((x, y), middle) > side_m for square in around for middle in squares.get(square, ())):
-            drawn.append(closure)
+            drawn.append(ends)
             squares.setdefault((column, row), []).append((x, y))
     return drawn
 

@@ -20,8 +20,6 @@ LARGEST_GRID: Final = 400_000
 """Cells of the search grid; in a larger map they are wider."""
 POCKET_M2: Final = 1.0
 """Smaller areas are no place for a robot."""
-STRAY_M: Final = 1.0
-"""A robot that stands farther from a passable cell reaches nothing."""
 VIEW_M: Final = 5.0
 """Side of the square around a frontier whose unknown area counts as its gain."""
 GAIN_M_PER_M2: Final = 0.5
@@ -29,8 +27,9 @@ GAIN_M_PER_M2: Final = 0.5
 KEEPING_M: Final = 3.0
 """Metres of path that another frontier must save before a robot turns to it."""
 SAME_M: Final = 1.0
-"""Frontiers this near to each other in two moments are the same one."""
-REACHED_M: Final = 0.5
+"""Frontiers this near to each other in two moments are the same one. A robot that stands farther from a passable cell
+reaches nothing."""
+REACHED_M: Final = 0.5 * SAME_M
 """A robot this near to a frontier sees what can be seen from there."""
 SHARING_M: Final = 20.0
 """Metres of path that a frontier costs more for each robot that goes there already."""
@@ -180,7 +179,7 @@ def start_cells(
     for at in np.floor((robots_xy - origin) / side_m).astype(np.int64)[:, ::-1]:
         row, column = np.clip(at, 0, np.array(passable.shape) - 1)
         start = nearest[:, row, column]
-        is_near = side_m * float(np.hypot(*(start - at))) <= STRAY_M
+        is_near = side_m * float(np.hypot(*(start - at))) <= SAME_M
         found.append((int(start[0]), int(start[1])) if is_near else None)
     return found
 

@@ -3,7 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fcslam.maps.drawing import DrawnClosure, map_png
+import numpy as np
+
+from fcslam.maps.drawing import map_png
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import ClosureStatus, FloatArray, LoopClosure
 from fcslam.runs import QUALITY
@@ -24,7 +26,7 @@ def picture(
         keyscans: poses (K, 3) of the keyscans in the map, by session.
     """
     lines = [
-        DrawnClosure(keyscans[i.robot][i.number, :2], keyscans[j.robot][j.number, :2], i.robot, j.robot)
+        np.array((keyscans[i.robot][i.number, :2], keyscans[j.robot][j.number, :2]))
         for i, j in ((closure.i, closure.j) for closure in closures if closure.status is ClosureStatus.ACCEPTED)
         if i.robot != j.robot and i.robot in keyscans and j.robot in keyscans
     ]

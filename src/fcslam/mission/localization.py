@@ -161,7 +161,7 @@ def _updated(
 
 
 def _map_files(occupancy: OccupancyMap, path: RobotTrajectory) -> dict[str, bytes]:
-    return {**server_files("map", occupancy), "map.png": map_png(occupancy, {path.robot: path.T_map_base}, ())}
+    return {**server_files("map", occupancy), "map.png": map_png(occupancy, {path.robot: path.T_map_base})}
 
 
 class LocalizedDrive:
