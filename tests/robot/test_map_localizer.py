@@ -11,7 +11,7 @@ from fcslam.lidar.frozen_map import frozen_map
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.uniqueness import best_elsewhere, two_best
+from fcslam.lidar.uniqueness import alignments, best_alignment
 from fcslam.maps.fusion import fuse
 from fcslam.maps.occupancy_map import Occupancy, parse_map
 from fcslam.mission.localization import run_localization
@@ -191,13 +191,11 @@ def test_the_best_alignment_is_the_one_that_nothing_elsewhere_beats(fleet):
         )
         for n in (len(scans), 12)
     )
-    best, rival = two_best(whole, part)
+    best, ratio = best_alignment(whole, part, 0.0)
     assert np.allclose(best.T_a_b, 0.0, atol=0.03)
-    other = best_elsewhere(whole, part, best.T_a_b)
-    assert rival is not None
-    assert other is not None
-    assert rival.score_m < best.score_m
-    assert other.score_m == pytest.approx(rival.score_m, rel=0.2)
+    assert ratio > 1.0
+    other = alignments(whole, part, best.T_a_b)[0]
+    assert best.score_m / other.score_m == pytest.approx(ratio, rel=0.2)
 
 
 def test_frozen_map_of_a_mission_matches_the_scans(fleet, building):

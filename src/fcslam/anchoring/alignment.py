@@ -74,7 +74,7 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
     It is looked for from all positions, and by the directions of walls or all headings. A map that is ``placed`` lies
     about there in the plan already, and no other place is looked for.
     """
-    from fcslam.lidar.uniqueness import align_map, is_elsewhere, two_best  # SciPy's transforms take long to load
+    from fcslam.lidar.uniqueness import align_map, best_alignment, is_elsewhere  # SciPy's transforms take long to load
 
     target = plan.submap
     if not len(building.surface):
@@ -84,11 +84,10 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
         if is_elsewhere(best.T_a_b, np.zeros(3), building.surface.points.mean(axis=0, keepdims=True)):
             best = align_map(target, building, best.T_a_b)
     else:
-        found = two_best(target, building, _headings(target, building))
+        found = best_alignment(target, building, LEAST_RIVAL_M, _headings(target, building))
         if found is None:
             return None
-        best, rival = found
-        lead = best.score_m / max(LEAST_RIVAL_M, rival.score_m if rival is not None else 0.0)
+        best, lead = found
     thickness_m = lengths_in_plan(target, building, best.T_a_b).thickness_m
     if LEAST_THICKNESS_M < abs(thickness_m) < MOST_THICKNESS_M:
         plan = replace(plan, thickness_m=thickness_m)

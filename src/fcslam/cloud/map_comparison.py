@@ -138,7 +138,7 @@ class MapComparison:
         earlier: "list[_Compared]",
     ) -> "_Compared | None":
         # SciPy's transforms take as long to load as a hundred scans, and most missions compare no maps.
-        from fcslam.lidar.uniqueness import align_map, rivals_of
+        from fcslam.lidar.uniqueness import align_map, alignments
 
         near_a = self._map_around(sessions[0], a.poses, a.poses[members.i, :2].mean(axis=0))
         near_b = self._map_around(sessions[1], b.poses, b.poses[members.j, :2].mean(axis=0))
@@ -157,7 +157,7 @@ class MapComparison:
             whole_a, whole_b = near_a.submap(), near_b.submap()
             best = align_map(whole_a, whole_b, T_i_j)
             fit = replace(fit, seen_m=best.known_m)
-            for rival in rivals_of(whole_a, whole_b, best.T_a_b)[:RIVALS]:
+            for rival in alignments(whole_a, whole_b, best.T_a_b)[:RIVALS]:
                 T = se2.compose(se2.compose(T_a_i, rival.T_a_b), se2.inverse(T_b_j))
                 found = local_maps.agreement(np.broadcast_to(T, b.poses.shape))
                 if found.support > fit.rival_support and refutation(_fit(found)) is None:

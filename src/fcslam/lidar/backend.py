@@ -14,7 +14,7 @@ from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.trajectory import transport_covariance
-from fcslam.lidar.closing import AnchoredSubmap, LocalClosure, LoopCloser, PlaceRecognizer
+from fcslam.lidar.closing import LocalClosure, LoopCloser, PlaceRecognizer
 from fcslam.lidar.frontend import SUBMAP_REACH_M, LidarConfig, MappedKeyscan
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.records import Constraint, ConstraintKind, FloatArray, frozen
@@ -82,13 +82,12 @@ class LidarBackend:
 
     def keyscan_poses(self) -> FloatArray:
         """``T_map_base`` of every keyscan so far, shape (N, 3), after a robust solve that changes nothing here."""
-        local, submaps = np.array(self._T_local_base).reshape(-1, 3), self._closer.submaps
-        if not submaps:
+        local, anchors = np.array(self._T_local_base).reshape(-1, 3), np.array(self._closer.keyscans)
+        if not len(anchors):
             return local
         poses = self._poses
         if self._closer.has_closures:
             poses = optimize_gnc(self._graph, poses, factors=self._factors).poses
-        anchors = np.array([submap.keyscan for submap in submaps])
         before = np.maximum(np.searchsorted(anchors, np.arange(len(local)), "right") - 1, 0)
         return se2.compose(poses[before], se2.between(local[anchors[before]], local))
 
@@ -108,16 +107,16 @@ class LidarBackend:
         self._add_anchor(anchor)
         self._window = window[first:]
         number = anchor.record.id.number
-        closures = self._close_loops(AnchoredSubmap(number, anchor.travel_m), submap)
+        closures = self._close_loops(number, anchor.travel_m, submap)
         ends = number + first - middle, number + last - middle
         return FinishedSubmap(number, *ends, submap.surface.points, closures)
 
     def _add_anchor(self, anchor: MappedKeyscan) -> None:
-        if not self._closer.submaps:
+        if not self._closer.keyscans:
             self._poses = anchor.T_odom_base[None]
             self._graph.add_variable(anchor.T_odom_base)
             return
-        between = range(self._closer.submaps[-1].keyscan + 1, anchor.record.id.number + 1)
+        between = range(self._closer.keyscans[-1] + 1, anchor.record.id.number + 1)
         motions = [k.odometry for k in self._window if k.odometry is not None and k.record.id.number in between]
         T_before_anchor, information = chained(motions)
         pose = se2.compose(self._poses[-1], T_before_anchor)
@@ -125,19 +124,18 @@ class LidarBackend:
         self._graph.add_edge(Edge(variable - 1, variable, T_before_anchor, information, robust=False))
         self._poses = np.vstack((self._poses, pose))
 
-    def _close_loops(self, anchored: AnchoredSubmap, submap: Submap) -> tuple[Constraint, ...]:
-        closures = self._closer.add(anchored, submap, self._poses)
+    def _close_loops(self, keyscan: int, travel_m: float, submap: Submap) -> tuple[Constraint, ...]:
+        closures = self._closer.add(keyscan, travel_m, submap, self._poses)
         for c in closures:
             self._graph.add_edge(Edge(c.earlier, c.later, c.check.T_a_b, c.check.information, robust=True))
         self._optimize_if_needed(closures)
         return tuple(self._constraint(closure) for closure in closures)
 
     def _constraint(self, closure: LocalClosure) -> Constraint:
-        submaps = self._closer.submaps
         return Constraint(
             self.robot,
-            submaps[closure.earlier].keyscan,
-            submaps[closure.later].keyscan,
+            self._closer.keyscans[closure.earlier],
+            self._closer.keyscans[closure.later],
             ConstraintKind.CLOSURE,
             frozen(closure.check.T_a_b),
             frozen(closure.check.information),
@@ -159,11 +157,9 @@ class LidarBackend:
 
 
 def chained(motions: Sequence[Constraint]) -> tuple[FloatArray, FloatArray]:
-    """Combine consecutive motions of a chain, one or more, into one.
+    """Combine consecutive motions of a chain, one or more, into one: its pose (3,) and information (3, 3).
 
-    Returns:
-        The motion from the first pose to the last, shape (3,), and its information in the tangent space at it (x, y,
-        theta of the last pose), shape (3, 3), to first order in the errors.
+    The information is in the tangent space at the motion, to first order in the errors.
     """
     after = [se2.IDENTITY]  # motion from the end of each one to the end of the chain, where covariances are added
     for motion in reversed(motions):

@@ -191,10 +191,8 @@ class _Fit(NamedTuple):
 def _fit(moved: FloatArray, seen: FloatArray, turned: FloatArray) -> _Fit:
     """Linear least squares of ``(R_m - I) c' + m = R(g) b / s``, with c = s c' and C = (c, g).
 
-    Args:
-        moved: motions m, shape (P, 3).
-        seen: motions b between the same scans, shape (P, 3).
-        turned: headings of R_m, shape (P,).
+    Motions m and b between the same scans, shape (P, 3), are ``moved`` and ``seen``; R_m turns by ``turned``, shape
+    (P,).
     """
     cos, sin = np.cos(turned), np.sin(turned)
     rows_x = np.stack((1.0 - cos, sin, seen[:, 0], -seen[:, 1]), axis=1)

@@ -78,19 +78,9 @@ RECOGNIZED_DRIFT = 0.25
 out of the search's reach."""
 
 
-@dataclass(frozen=True, slots=True)
-class AnchoredSubmap:
-    """Where a submap is on the robot's path."""
-
-    keyscan: int
-    """Number of the anchor."""
-    travel_m: float
-    """Path length up to the anchor, metres (turns count a little)."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalClosure:
-    """A verified closure between the anchors of two submaps of one robot (indices into ``LoopCloser.submaps``)."""
+    """A verified closure between the anchors of two submaps of one robot (indices into ``LoopCloser.keyscans``)."""
 
     earlier: int
     later: int
@@ -134,10 +124,10 @@ class LoopCloser:
 
     def __init__(self, recognizer: PlaceRecognizer | None = None) -> None:
         self._recognizer = recognizer
-        self.submaps: list[AnchoredSubmap] = []
-        """All submaps so far."""
+        self.keyscans: list[int] = []
+        """Number of the anchor of each submap so far."""
         self._travel = np.empty(0)
-        """Path length up to each of them, metres."""
+        """Path length up to each of them, metres (turns count a little)."""
         self._held: dict[int, bytes] = {}
         """The submaps that others are compared with, by index; the oldest of a well-known area are forgotten."""
         self._submap = lru_cache(UNPACKED)(lambda index: read_submap(self._held[index]))
@@ -150,20 +140,15 @@ class LoopCloser:
         """Whether any closure was accepted."""
         return bool(self._accepted)
 
-    def add(self, anchored: AnchoredSubmap, submap: Submap, anchors: FloatArray) -> list[LocalClosure]:
-        """Compare the next submap with earlier ones.
+    def add(self, keyscan: int, travel_m: float, submap: Submap, anchors: FloatArray) -> list[LocalClosure]:
+        """Compare the next submap, its anchor's number and the path length up to there with earlier ones.
 
-        Args:
-            anchored: where the next submap is on the path.
-            submap: its surfaces.
-            anchors: ``T_map_base`` of the anchors of all submaps with this one, shape (S, 3).
-
-        Returns:
-            The closures that are accepted now: of this submap, and pending ones that it supports.
+        ``anchors`` are the poses of the anchors of all submaps with this one, shape (S, 3). Returns the closures that
+        are accepted now: of this submap, and pending ones that it supports.
         """
-        later = len(self.submaps)
-        self.submaps.append(anchored)
-        self._travel = np.append(self._travel, anchored.travel_m)
+        later = len(self.keyscans)
+        self.keyscans.append(keyscan)
+        self._travel = np.append(self._travel, travel_m)
         self._held[later] = submap_bytes(submap)
         is_known = self._forget_surplus(anchors)
         paths = self._paths_from(later)
@@ -183,11 +168,11 @@ class LoopCloser:
             index = int(held[row])
             del self._held[index]
             if self._recognizer is not None:
-                self._recognizer.forget(self.submaps[index].keyscan)
+                self._recognizer.forget(self.keyscans[index])
         return len(surplus) > 0
 
     def _is_held(self) -> NDArray[np.bool_]:
-        held = np.zeros(len(self.submaps), np.bool_)
+        held = np.zeros(len(self.keyscans), np.bool_)
         held[list(self._held)] = True
         return held
 
@@ -216,12 +201,19 @@ class LoopCloser:
         best.sort(key=lambda k: distance[k])
         return best
 
-    def _compare(self, earlier: int, later: int, anchors: FloatArray, path_m: float) -> LocalClosure | None:
+    def _compare(
+        self, earlier: int, later: int, anchors: FloatArray, path_m: float, recognized: FloatArray | None = None
+    ) -> LocalClosure | None:
+        """Verify a closure where it is ``recognized``, or where a search finds it if the drift allowance is wide.
+
+        None if the submaps do not show the same place, or if no drift explains where it is.
+        """
         a, b = self._submap(earlier), self._submap(later)
-        predicted = se2.between(anchors[earlier], anchors[later])
+        guess = predicted = se2.between(anchors[earlier], anchors[later])
         radius, angle = self._drift_allowance(path_m).tolist()
-        guess = predicted
-        if radius > NARROW_M:
+        if recognized is not None:
+            guess = recognized
+        elif radius > NARROW_M:
             window = SearchWindow(radius, angle, DISTANCE_PENALTY, ANGLE_PENALTY)
             result = search(b.surface, a.field, predicted, window)
             if result.score < LEAST_SCORE:
@@ -229,13 +221,15 @@ class LoopCloser:
             guess = result.T_field_base
         check = verify(a, b, guess, VERIFICATION)
         innovation = se2.between(predicted, check.T_a_b)
-        outside = (
-            np.hypot(innovation[0], innovation[1]) > radius + ALIGNMENT_MARGIN_M
-            or abs(innovation[2]) > angle + ALIGNMENT_MARGIN_RAD
-        )
-        if not (check.loose or check.support) or outside:
+        off_m, off_rad = float(np.hypot(innovation[0], innovation[1])), abs(float(innovation[2]))
+        if recognized is None:
+            is_explained = off_m <= radius + ALIGNMENT_MARGIN_M and off_rad <= angle + ALIGNMENT_MARGIN_RAD
+        else:
+            is_explained = off_m <= RECOGNIZED_DRIFT * path_m
+        if not (check.loose or check.support) or not is_explained:
             return None
-        return LocalClosure(earlier, later, check, innovation, radius)
+        beyond = recognized is not None and (off_m > radius or off_rad > angle)
+        return LocalClosure(earlier, later, check, innovation, radius, beyond)
 
     def _recognized(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[LocalClosure]:
         """The best closure that place recognition proposes beyond the search's reach.
@@ -244,13 +238,13 @@ class LoopCloser:
         """
         if self._recognizer is None:
             return []
-        newest = self.submaps[later]
-        self._recognizer.store(newest.keyscan, self._submap(later).surface.points)
+        newest = self.keyscans[later]
+        self._recognizer.store(newest, self._submap(later).surface.points)
         found = [
             closure
             for earlier in self._lookalikes(self._recognizer, later, anchors, paths)
-            for guess in self._recognizer.motions(self.submaps[earlier].keyscan, newest.keyscan)
-            if (closure := self._check(earlier, later, anchors, paths[earlier], guess)) is not None
+            for guess in self._recognizer.motions(self.keyscans[earlier], newest)
+            if (closure := self._compare(earlier, later, anchors, paths[earlier], guess)) is not None
         ]
         if len(found) > 1 and not consistency(found, self._travel, anchors).all():
             return []
@@ -264,26 +258,13 @@ class LoopCloser:
         unsure = capped | (distance > SIGHT_M + drift[:, 0])
         possible = distance < SIGHT_M + RECOGNIZED_DRIFT * paths
         eligible = np.flatnonzero(unsure & possible & (travel[later] - travel > LEAST_GAP_M) & self._is_held())
-        number = {self.submaps[k].keyscan: int(k) for k in eligible}
+        number = {self.keyscans[k]: int(k) for k in eligible}
         chosen: list[int] = []
-        for keyscan in recognizer.most_similar(self.submaps[later].keyscan, number, SIMILAR_PLACES) if number else ():
+        for keyscan in recognizer.most_similar(self.keyscans[later], number, SIMILAR_PLACES) if number else ():
             k = number[keyscan]
             if all(abs(travel[k] - travel[other]) > SIGHT_M for other in chosen):
                 chosen.append(k)
         return chosen[:MOST_CANDIDATES]
-
-    def _check(
-        self, earlier: int, later: int, anchors: FloatArray, path_m: float, guess: FloatArray
-    ) -> LocalClosure | None:
-        """Verify a recognised place; None if it is another one, or if no drift explains where it is."""
-        check = verify(self._submap(earlier), self._submap(later), guess, VERIFICATION)
-        innovation = se2.between(se2.between(anchors[earlier], anchors[later]), check.T_a_b)
-        off_m = float(np.hypot(innovation[0], innovation[1]))
-        if not (check.loose or check.support) or off_m > RECOGNIZED_DRIFT * path_m:
-            return None
-        radius, angle = self._drift_allowance(path_m).tolist()
-        beyond = off_m > radius or abs(innovation[2]) > angle
-        return LocalClosure(earlier, later, check, innovation, radius, beyond)
 
     def _accept(
         self, found: list[LocalClosure], recognized: list[LocalClosure], anchors: FloatArray
@@ -292,9 +273,7 @@ class LoopCloser:
         pairs = {(c.earlier, c.later) for c in found}
         fresh = [c for c in recognized if (c.earlier, c.later) not in pairs]
         self._pending += [c for c in (*found, *fresh) if c not in accepted and c.check.support]
-        self._pending = [
-            c for c in self._pending if self.submaps[-1].travel_m - self.submaps[c.later].travel_m < PENDING_M
-        ]
+        self._pending = [c for c in self._pending if self._travel[-1] - self._travel[c.later] < PENDING_M]
         cluster = supported(self._pending, self._travel, anchors)
         accepted += cluster
         self._pending = [c for c in self._pending if c not in cluster]
@@ -315,13 +294,9 @@ class LoopCloser:
 def supported(pending: Sequence[LocalClosure], travel: FloatArray, anchors: FloatArray) -> list[LocalClosure]:
     """The closures that support each other enough to be accepted, whatever their order.
 
-    A cluster is a closure with all those consistent with it. If several are large enough, the one with the most
-    support counts; of equal ones, the latest.
-
-    Args:
-        pending: verified closures that need support.
-        travel: path length up to each submap, shape (S,), metres.
-        anchors: ``T_map_base`` of the anchors of all submaps, shape (S, 3).
+    A cluster is a closure with all those consistent with it. If several are large enough, the one with the most support
+    counts; of equal ones, the latest. ``travel`` (S,) is the path length up to each submap, and ``anchors`` (S, 3) are
+    the poses of their anchors.
     """
     if len(pending) < MINIMUM_SUPPORT:
         return []

@@ -77,15 +77,9 @@ def likelihood_pyramid(
     cell_m: float = CELL_M,
     smear_m: float = CELL_M,
 ) -> LikelihoodPyramid:
-    """Draw the surfaces around the guess and build the pyramid.
+    """Draw the surfaces around the guess, its centre, and build the pyramid of some ``levels``.
 
-    Args:
-        field: surfaces.
-        T_field_guess: centre of the grid, shape (3,), metres and radians in the field's coordinates.
-        half_side_m: half side of the grid, metres.
-        visible_only: draw only surfaces that face the guess (Karto's visibility filter), for one scan near the guess.
-        levels: number of levels.
-        cell_m, smear_m: as in ``SearchWindow``.
+    ``visible_only`` draws only surfaces that face the guess (Karto's visibility filter), for one scan near the guess.
     """
     size = math.ceil(2.0 * half_side_m / cell_m) + 1
     corner = np.asarray(T_field_guess[:2]) - half_side_m
@@ -106,17 +100,8 @@ def search(
 ) -> SearchResult:
     """Find the best pose of a scan in a window around the guess, to half a cell and half an angle step.
 
-    Args:
-        scan: points in ``base``.
-        field: surfaces.
-        T_field_guess: centre of the window, shape (3,), metres and radians in the field's coordinates.
-        window: half side, half angle and penalties.
-        visible_only: match only surfaces that face the guess.
-        better_than: a pose in the window, shape (3,), whose score the result must exceed; it prunes the search.
-
-    Returns:
-        The best pose; ``better_than`` if none exceeds its score; the guess itself, with score 0, if no pose of the
-        window puts a point on a surface.
+    ``visible_only`` matches only surfaces that face the guess. The result is ``better_than``, a pose in the window, if
+    none exceeds its score, which prunes the search; it is the guess with score 0 if no pose puts a point on a surface.
     """
     cell_m = window.cell_m
     thinned = scan.thinned(cell_m, MOST_POINTS)

@@ -48,10 +48,7 @@ CORNER: Final = float(np.cos(np.radians(35.0)))
 def over_steps(error: OdometryError, moved_m: float, step_m: float) -> OdometryError:
     """Error of odometry over several steps whose errors are independent.
 
-    Args:
-        error: the error over all steps if they all erred the same way.
-        moved_m: travel over all steps, metres.
-        step_m: travel of the last one, metres.
+    ``error`` is that of all steps if they erred the same way; they moved by ``moved_m``, the last one by ``step_m``.
     """
     share = math.sqrt(min(1.0, max(step_m, LEAST_STEP_M) / max(moved_m, LEAST_STEP_M)))
     return OdometryError(share * error.position_m, share * error.heading_rad)
@@ -66,16 +63,14 @@ def resolve(
     turned_rad: float,
     velocity_information: FloatArray = FIXED,
 ) -> tuple[ScanMatch, bool]:
-    """Choose between a match and one that trusts odometry as far as it was right so far.
+    """Choose between a match that hardly trusts odometry and one that trusts it as far as it was right so far.
 
     Args:
-        scan: the points that were matched.
-        field: surfaces seen so far.
+        scan, field, velocity_information: as in ``match_scan``.
         T_field_guess: the pose by odometry, shape (3,), metres and radians.
         match: the match that hardly trusts odometry.
         learned: the error of odometry as learned from earlier matches.
         turned_rad: turn that odometry measured, radians.
-        velocity_information: as in ``match_scan``.
 
     Returns:
         The chosen match, and whether the scan contradicts odometry that is chosen, so that nothing is learned from it.
@@ -99,13 +94,9 @@ def resolve(
 
 
 def surface_gain(scan: PointScan, gains: FloatArray) -> float:
-    """Gain of a scan's log-likelihood at one pose over another, where each surface adds at most ``SURFACE_NATS``.
+    """Gain (N,) of a scan's log-likelihood at one pose over another, where each surface adds at most ``SURFACE_NATS``.
 
     Points without a normal do not count: rough ground has none, and at corners they belong to two surfaces.
-
-    Args:
-        scan: the points.
-        gains: gain of each, shape (N,).
     """
     by_surface = np.bincount(surfaces(scan), gains * scan.normals.any(axis=1))
     return float(np.clip(by_surface, -SURFACE_NATS, SURFACE_NATS).sum())

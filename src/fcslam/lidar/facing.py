@@ -118,12 +118,9 @@ class ScanPair(NamedTuple):
 
 
 def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
-    """How the laser faces if it is certainly not as stated; None if the scans fit the odometry or say nothing.
+    """How a laser faces if it is certainly not as stated; None if the scans fit the odometry or say nothing.
 
     If it faces as stated in the result, the scans fit the odometry in no certain way.
-
-    Args:
-        scans: of one laser, with odometry; as many are read as are needed.
     """
     trial = _Trial(*_pairs(islice(scans, MOST_COMPARED)))
     as_stated = trial.agreements(AS_STATED)

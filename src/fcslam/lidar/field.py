@@ -277,14 +277,7 @@ def _tile_at(tx, ty, field):  # type: ignore[no-untyped-def]
 
 
 def field_of(scans: list[tuple[PointScan, FloatArray]]) -> SurfelField:
-    """Build a field around the first of several scans.
-
-    Args:
-        scans: points in ``base`` and ``T_field_base``, shape (3,), of each scan.
-
-    Returns:
-        The field.
-    """
+    """Build a field around the first of several scans, each with its ``T_field_base``, shape (3,)."""
     field = SurfelField(scans[0][1] if scans else se2.IDENTITY)
     for scan, T_field_base in scans:
         field.insert(scan, T_field_base)

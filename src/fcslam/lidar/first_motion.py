@@ -29,13 +29,7 @@ SIGMAS: Final = 3.0
 def first_sweep(first: LaserScan, second: LaserScan, odometry: OdometryModel) -> Sweep | None:
     """The sweep of the first scan of a robot, with the velocity that the second one shows.
 
-    Args:
-        first: the first scan.
-        second: the next scan.
-        odometry: error of a motion that is predicted.
-
-    Returns:
-        The sweep; without velocity if the scans show no motion; that of ``first`` if they cannot be compared.
+    It has no velocity if the scans show no motion; it is that of ``first`` if they cannot be compared.
     """
     elapsed_s = second.stamp - first.stamp
     is_one_laser = first.laser.T_base_laser == second.laser.T_base_laser

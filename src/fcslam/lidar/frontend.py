@@ -160,15 +160,7 @@ class LidarFrontend:
         return self._tracker.localize(scan)
 
     def process(self, scan: LaserScan, tracking: TrackingResult | None = None) -> Step:
-        """Process the next scan.
-
-        Args:
-            scan: the scan.
-            tracking: its result of ``localize``, if that was called before.
-
-        Returns:
-            The pose of the scan, and the keyscan that it became.
-        """
+        """Process the next scan, with its result of ``localize`` if that was called before; returns what it became."""
         # 1. Scan matching against the running buffer.
         tracking = self._tracker.localize(scan) if tracking is None else tracking
         self._tracker.commit(tracking)
@@ -209,13 +201,9 @@ class LidarFrontend:
         self._begun_m = self.travel_m
 
     def recent_submap(self, until_s: float = math.inf) -> tuple[Submap, FloatArray]:
-        """The submap of the last ``SUBMAP_REACH_M`` of travel.
+        """The submap of the last ``SUBMAP_REACH_M`` in the base of its newest keyscan, and ``T_local_base`` of that.
 
-        Args:
-            until_s: later keyscans are left out, seconds, as long as one is left.
-
-        Returns:
-            The submap, in the base of its newest keyscan, and ``T_local_base`` of this keyscan, shape (3,).
+        Keyscans later than ``until_s``, seconds, are left out, as long as one is left.
         """
         keyscans = [keyscan for keyscan in self._recent if keyscan.record.stamp < until_s] or [self._recent[0]]
         anchor = keyscans[-1].T_local_base
@@ -277,17 +265,10 @@ def _tracker(config: LidarConfig, odometry: OdometryModel) -> ScanTracker:
 
 
 def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: OdometryModel) -> FloatArray:
-    """Information of the motion between two consecutive keyscans.
+    """Information (3, 3) of the ``motion`` (3,) to a keyscan from the one before, in the tangent space at the motion.
 
-    The sum of the points' information and odometry's, limited by a floor of the standard deviations.
-
-    Args:
-        motion: pose of the later keyscan in the earlier one, shape (3,), metres and radians.
-        tracked: the later keyscan.
-        odometry: error of the odometry, used if the scan was not matched or there is no odometry.
-
-    Returns:
-        Information in the tangent space at ``motion`` (x, y, theta of the later keyscan), shape (3, 3).
+    The sum of the points' information and odometry's, limited by a floor of the standard deviations. The error of
+    ``odometry`` counts if the scan was not matched or there are no wheels.
     """
     x, y, turn = motion.tolist()
     moved, turned = math.hypot(x, y), abs(turn)

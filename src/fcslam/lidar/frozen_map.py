@@ -25,12 +25,7 @@ FINEST_M, COARSEST_M = 0.002, 0.25
 
 
 def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
-    """The surfaces and the free space of a map, in the coordinate frame of the map.
-
-    Args:
-        occupancy: the map.
-        name: what messages call it.
-    """
+    """The surfaces and the free space of a map, which messages call ``name``, in the coordinate frame of the map."""
     side = occupancy.resolution_m
     if side > COARSEST_M:
         raise SourceError(f"{name}: cells of {side:g} m are too coarse; localization needs {COARSEST_M:g} m or finer")

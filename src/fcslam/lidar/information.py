@@ -11,16 +11,10 @@ Diagonal = tuple[float, float, float]
 
 
 def limited_information(points: FloatArray, heading_rad: float, prior: Diagonal, variance: Diagonal) -> FloatArray:
-    """``((R' P R + diag(prior))^-1 + diag(variance))^-1``, with the information P of the points and the heading R.
+    """``((R' P R + diag(prior))^-1 + diag(variance))^-1``, shape (3, 3), over (x, y, theta) of the robot.
 
-    Args:
-        points: information over (x, y) in a field and theta, shape (3, 3); writable, as code is compiled once.
-        heading_rad: of the robot in the field.
-        prior: information over (x, y, theta) of the robot, positive.
-        variance: least variance over (x, y, theta) of the robot.
-
-    Returns:
-        Information over (x, y, theta) of the robot, shape (3, 3).
+    ``points`` P is over (x, y) in a field and theta; writable, as code is compiled once. R is the robot's heading
+    there. The ``prior`` is positive, and ``variance`` the least one.
     """
     information: FloatArray = _limited(points, heading_rad, prior, variance)
     return information

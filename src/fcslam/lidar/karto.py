@@ -35,10 +35,8 @@ NEAR_BEST: Final = 0.1
 class KartoTracker(ScanTracker):
     """Tracks one robot as the front end of Karto does.
 
-    Args:
-        odometry: the error of odometry; a motion that is only predicted passes the gates at every scan.
-        travel_m: gate: distance to the last keyscan from which on a scan is matched, metres.
-        turn_rad: gate: the same for the heading, radians.
+    A scan is matched from a distance of ``travel_m``, or a turn of ``turn_rad``, from the last keyscan on. A motion
+    that is only predicted passes these gates at every scan.
     """
 
     def __init__(self, odometry: OdometryModel, travel_m: float, turn_rad: float) -> None:
@@ -92,13 +90,7 @@ class KartoTracker(ScanTracker):
 
 
 def match_covariance(scan: PointScan, field: SurfelField, T_field_base: FloatArray) -> FloatArray:
-    """Covariance of a match over (x, y) in the field and theta, shape (3, 3): moments of the likelihoods near it.
-
-    Args:
-        scan: points in ``base``.
-        field: surfaces.
-        T_field_base: the best pose, shape (3,), metres and radians.
-    """
+    """Covariance (3, 3) of the best pose (3,) over (x, y) in the field and theta: moments of the likelihoods."""
     half_side_m = float(np.max(np.hypot(*scan.points.T), initial=0.0)) + 2.0 * WINDOW.radius_m
     grid = likelihood_pyramid(field, T_field_base, half_side_m, True, 1, WINDOW.cell_m, WINDOW.smear_m)
     steps = np.arange(-8.0, 9.0)

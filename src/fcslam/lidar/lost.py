@@ -92,8 +92,8 @@ def is_doubtful(
 ) -> bool:
     """Whether a scan may show another place than the scans before it.
 
-    So may a scan without odometry that was not accepted: nothing else says where the robot is. And so may all scans
-    while the robot leaves a closed cabin.
+    So may a scan without odometry that was not accepted, as nothing else says where the robot is, and all scans while
+    the robot leaves a closed cabin.
     """
     if frontend.settled_m < SETTLED_M or not config.doubted:
         return False
@@ -113,12 +113,10 @@ def can_decide(scans: Sequence[LaserScan], travel_m: float = DOUBTFUL_TRAVEL_M, 
 
 
 def is_lost(scans: Sequence[LaserScan], frontend: LidarFrontend, closed_s: float | None = None) -> bool:
-    """Whether deferred scans show another place than the newest keyscans of the front end.
+    """Whether consecutive scans that the front end has deferred show another place than its newest keyscans.
 
-    Args:
-        scans: consecutive scans that the front end has not processed.
-        frontend: the robot's front end; it does not change.
-        closed_s: stamp at which the door of the cabin closed that the robot leaves, seconds; None: it leaves none.
+    ``closed_s`` is the stamp at which the door of the cabin closed that the robot leaves, seconds; None: it leaves
+    none.
     """
     fresh = frontend.fresh()
     if not _are_consistent(scans, fresh):
@@ -138,26 +136,20 @@ def is_unplaced(scan: LaserScan, frontend: LidarFrontend) -> bool:
 def relocated(scans: Sequence[LaserScan], frontend: LidarFrontend) -> FloatArray | None:
     """Where deferred scans are among the newest keyscans of the front end, wherever they were predicted.
 
-    Args:
-        scans: consecutive scans that the front end has not processed.
-        frontend: the robot's front end; it does not change.
-
-    Returns:
-        Pose of the first of them in the local frame of the tracker, shape (3,), metres and radians: where they fit
-        clearly best, or else where they were predicted if they agree with the keyscans there. None: neither.
+    The pose (3,) of the first of them in the local frame of the tracker: where they fit clearly best, or else where
+    they were predicted if they agree with the keyscans there. None: neither.
     """
-    from fcslam.lidar.uniqueness import two_best  # SciPy's transforms take long to load, and few robots need them
+    from fcslam.lidar.uniqueness import best_alignment  # SciPy's transforms take long to load, and few robots need them
 
     fresh = frontend.fresh()
     if not _are_consistent(scans, fresh):
         return None
     (before, T_local_before), (now, T_first_now) = frontend.recent_submap(), fresh.recent_submap()
-    found = two_best(before, now)
+    found = best_alignment(before, now, LEAST_RIVAL_M)
     if found is None:
         return None
-    best, rival = found
-    against_m = LEAST_RIVAL_M if rival is None else max(LEAST_RIVAL_M, rival.score_m)
-    if best.score_m >= LEAST_RATIO * against_m and best.violation <= LARGEST_VIOLATION:
+    best, ratio = found
+    if ratio >= LEAST_RATIO and best.violation <= LARGEST_VIOLATION:
         return se2.compose(se2.compose(T_local_before, best.T_a_b), se2.inverse(T_first_now))
     T_local_first = frontend.localize(scans[0]).tracked.T_local_base
     worse, gate = _agreement_at(T_local_first, frontend, fresh), VERIFICATION.loose
@@ -168,10 +160,9 @@ def relocated(scans: Sequence[LaserScan], frontend: LidarFrontend) -> FloatArray
 def _agreement_at(
     T_local_first: FloatArray, frontend: LidarFrontend, fresh: LidarFrontend, until_s: float = math.inf
 ) -> Agreement:
-    """How well the map of the deferred scans in ``fresh`` agrees with the newest keyscans of the front end.
+    """How well the deferred scans in ``fresh``, whose first one begins at a pose (3,), agree with the newest keyscans.
 
-    ``T_local_first``, shape (3,), is the pose of the first of them, where the alignment begins. Keyscans later than
-    ``until_s``, seconds, are left out.
+    Keyscans later than ``until_s``, seconds, are left out.
     """
     (before, T_local_before), (now, T_first_now) = frontend.recent_submap(until_s), fresh.recent_submap()
     predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
@@ -193,12 +184,8 @@ def drove_on(
 ) -> bool:
     """Whether trusted odometry and the scans themselves agree that a robot drove from the last scans to doubtful ones.
 
-    One pair of scans is enough: on a bump, a scan or two show only the ground.
-
-    Args:
-        before: the last scan of each laser before the doubtful ones, by its mounting.
-        scans: consecutive doubtful scans.
-        odometry, trust: the error of odometry by the model and as learned.
+    One pair of scans is enough: on a bump, a scan or two show only the ground. ``before`` is the last scan of each
+    laser, by its mounting; the error of odometry is that of the model and as learned.
     """
     # The constraint over the gap has the error by the model, of scale 1.
     is_trusted = trust.matches >= FIRST_MATCHES and max(trust.position, trust.heading) <= 1.0

@@ -131,12 +131,9 @@ def noise_of(maps: Iterable[LocalSubmap]) -> Noise:
 
 
 def compare(a: LocalSubmap, b: LocalSubmap, T_a_b: FloatArray, noise: Noise) -> PlaceAgreement:
-    """Compare two local maps at a transform, each map's walls with the other map.
+    """Compare two local maps at a transform (3,), each map's walls with the other map.
 
-    Args:
-        a, b: local maps.
-        T_a_b: the transform, shape (3,), metres and radians.
-        noise: of the noisier robot; the share by which it contradicts itself is not counted.
+    ``noise`` is that of the noisier robot; the share by which it contradicts itself is not counted.
     """
     in_free = IN_FREE + min(MOST_SELF_IN_FREE, max(a.in_free, b.in_free))
     in_free_elsewhere = in_free + IN_FREE_ELSEWHERE - IN_FREE

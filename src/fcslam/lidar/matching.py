@@ -92,16 +92,12 @@ def match_scan(
     matching as in Dellenbach et al., "CT-ICP", ICRA 2022, with one velocity for a scan.
 
     Args:
-        scan: points in ``base``.
-        field: surfaces.
+        scan, field: points in ``base``, and surfaces.
         T_field_guess: start, and mean of the prior, shape (3,), metres and radians.
         prior_information: over (x, y, theta) in the field's coordinates, shape (3, 3); zeros for no prior.
         velocity_information: of the assumed velocity (x, y, theta), shape (3,), in (m/s)^-2 and (rad/s)^-2.
         wide_scale_m: scale of the robust loss at the first step, metres.
         clutter_scale_m: least scale of the loss of points without a normal, metres.
-
-    Returns:
-        The pose, the information of the points, and how well they fit.
     """
     return ScanMatch(
         *_match(

@@ -71,8 +71,7 @@ class OccupancyConfig(Settings):
 class OccupancyGrid:
     """Beam counts per cell; row 0 is the lowest y, column 0 the lowest x.
 
-    Cell edges lie on multiples of the resolution, which is that of the configuration, doubled as often as the limit
-    on cells asked for.
+    Cell edges lie on multiples of the resolution, doubled as often as the limit on cells asked for.
     """
 
     hits: Counts
@@ -138,33 +137,19 @@ def cast(keyscans: Sequence[Casting], config: OccupancyConfig) -> OccupancyGrid:
     The grid spans all hits, all lasers and what beams without return clear; longer beams clear cells inside of it only.
     A beam without return (inf) may have met a surface that is black, glass or grazed. So it clears no farther than the
     nearer of the two returns beside it, and no farther than the line between them. Where they are half a turn or more
-    apart, as in a hall, no line is between them: the beam clears as far as the scan has a return. It ends at cells
-    that remain occupied.
-
-    Args:
-        keyscans: the scans.
-        config: resolution, usable range and size.
-
-    Returns:
-        Counts, shape (H, W), in ``map``.
+    apart, as in a hall, no line is between them: the beam clears as far as the scan has a return. It ends at cells that
+    remain occupied.
     """
     (grid,) = cast_periods([keyscans], config)
     return grid
 
 
 def cast_periods(periods: Sequence[Sequence[Casting]], config: OccupancyConfig) -> Iterator[OccupancyGrid]:
-    """The grid after each period, from the oldest to the newest; all have one size.
+    """The grid after each period, from the oldest to the newest; all have one size. The next step changes their counts.
 
     A period changes an occupied cell to free if at least ``contradicting_scans`` scans look through the cell and at
     most ``CLEAR_RATIO`` of their beams end there. It changes a free cell to occupied if as many beams of as many scans
     end there, and enough to call the cell occupied. The counts of earlier periods are then dropped, else added.
-
-    Args:
-        periods: scans of each period, as for ``cast``.
-        config: as for ``cast``.
-
-    Yields:
-        Counts, shape (H, W), in ``map``; the next step changes them.
     """
     groups = [_by_laser(keyscans, config) for keyscans in periods]
     layout = _layout([beams for period in groups for beams in period], config)
@@ -187,12 +172,7 @@ def draw_over(base: OccupancyMap, scans: Sequence[Casting], config: OccupancyCon
     """A finished map with newer scans drawn into it, as ``cast_periods`` draws a period after another one.
 
     Scans decide the cells that the map does not know. They change a known cell only if at least ``contradicting_scans``
-    of them contradict it.
-
-    Args:
-        base: the map; its cells keep their side.
-        scans: newer scans, with poses in ``map``.
-        config: usable range and thresholds.
+    of them contradict it. The cells of the map keep their side.
     """
     side = base.resolution_m
     column, row = (round(value / side) for value in base.origin_xy)

@@ -75,13 +75,7 @@ class OdometryError(NamedTuple):
 
 
 def odometry_error(moved_m: float, turned_rad: float, model: OdometryModel) -> OdometryError:
-    """Error of a motion by the model for every robot.
-
-    Args:
-        moved_m: travel, metres.
-        turned_rad: turn, radians, not negative.
-        model: the model.
-    """
+    """Error of a motion of ``moved_m`` and ``turned_rad`` (not negative) by the model."""
     return OdometryError(
         model.position_m + model.position_per_travel * moved_m + model.position_per_turn_m * turned_rad,
         model.heading_rad + model.heading_per_turn * turned_rad + model.heading_per_travel_rad * moved_m,
@@ -102,12 +96,7 @@ class OdometryTrust:
         return OdometryError(self.position * error.position_m, self.heading * error.heading_rad)
 
     def learn(self, innovation: Pose, error: OdometryError) -> "OdometryTrust":
-        """Learn from a good match.
-
-        Args:
-            innovation: matched pose relative to the pose by odometry, metres and radians.
-            error: error of that motion by the model.
-        """
+        """Learn from the pose of a good match relative to that by odometry, whose error by the model is ``error``."""
         rate = 1.0 / min(FIRST_MATCHES + self.matches, LATEST_MATCHES)
         x, y, theta = innovation
         return OdometryTrust(

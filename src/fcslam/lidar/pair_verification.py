@@ -203,10 +203,8 @@ _keeping: Final = threading.Lock()
 def align_batch(names: Sequence[bytes], new: Mapping[bytes, bytes], rows: bytes) -> Answer:
     """The alignments of a batch, in another process.
 
-    Args:
-        names: hashes of the submaps that the batch compares.
-        new: those that the process was not sent yet, by their hashes.
-        rows: float64, shape (N, 14): the numbers of both submaps in ``names``, the guess and its prior, of each pair.
+    It compares submaps named by their hashes, of which ``new`` ones were not sent yet. ``rows``, float64 of shape (N,
+    14), has the numbers of both submaps in ``names``, the guess and its prior for each pair.
     """
     with _keeping:
         for name, data in new.items():

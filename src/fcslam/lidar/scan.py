@@ -67,15 +67,9 @@ class PointScan:
 
 
 def point_scan(ranges_m: Ranges, laser: LaserModel, sweep: Sweep | None = None) -> PointScan:
-    """Convert the valid ranges of a scan (finite, over 0, below the maximum) to points with normals.
+    """The valid ranges (beam_count,) of a scan (finite, over 0, below the maximum) as points with normals.
 
-    Args:
-        ranges_m: shape (beam_count,), metres.
-        laser: geometry and mounting of the laser.
-        sweep: when the beams were measured, and the motion meanwhile; each return is placed where the robot was then.
-
-    Returns:
-        Points and normals in ``base`` at the stamp, shape (N, 2).
+    Each return of a ``sweep`` is placed where the robot was then.
     """
     if ranges_m.shape != (laser.beam_count,):
         raise ValueError(f"the laser has {laser.beam_count} beams, the scan ranges of shape {ranges_m.shape}")

@@ -66,14 +66,9 @@ class Submap:
 
 
 def build_submap(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float = RADIUS_M) -> Submap:
-    """Build a submap.
+    """Build a submap of scans with their ``T_anchor_base``, shape (3,), in the anchor's base.
 
-    Args:
-        scans: points in ``base`` and ``T_anchor_base``, shape (3,), metres and radians, of each scan.
-        radius_m: surfaces and free space farther than this from the anchor are left out.
-
-    Returns:
-        The submap in the anchor's base.
+    Surfaces and free space farther than ``radius_m`` from the anchor are left out.
     """
     near = [(_near(scan, pose, radius_m), pose) for scan, pose in scans]
     field = field_of(near)
@@ -217,16 +212,7 @@ class Agreement:
 
 
 def agreement(query: Submap, target: Submap, T_target_query: FloatArray) -> Agreement:
-    """Measure how well ``query`` agrees with ``target``.
-
-    Args:
-        query: the submap whose points are counted.
-        target: the submap that they are compared with.
-        T_target_query: pose of the query's anchor in the target's anchor, shape (3,), metres and radians.
-
-    Returns:
-        Shares of points, and the normal tensor.
-    """
+    """Measure how well ``query``, whose points are counted, agrees with ``target``, in which it has the pose (3,)."""
     known, explained, violating, tensor = _agreement(
         query.surface.points,
         query.surface.normals,
@@ -243,10 +229,7 @@ def self_violation(scans: Sequence[tuple[PointScan, FloatArray]]) -> float:
     """How much a submap contradicts itself: its odd scans against its even ones, the worse of both directions.
 
     Range errors, mixed pixels and poses that are off all raise it; it is a measure of the scanner's noise on the scale
-    of ``Agreement.violation``.
-
-    Args:
-        scans: as for ``build_submap``; a single one does not contradict itself.
+    of ``Agreement.violation``. The scans are as for ``build_submap``; a single one does not contradict itself.
     """
     if len(scans) < 2:
         return 0.0

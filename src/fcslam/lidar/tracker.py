@@ -180,13 +180,7 @@ class ScanTracker:
         self._state = result.state
 
     def insert(self, points: PointScan, T_local_base: FloatArray, laser_count: int = 1) -> None:
-        """Add a keyscan to the running buffer.
-
-        Args:
-            points: returns of the keyscan, in its ``base``.
-            T_local_base: pose of the keyscan, shape (3,).
-            laser_count: lasers whose keyscans take turns in the buffer.
-        """
+        """Add a keyscan in its ``base`` to the running buffer, which the keyscans of some lasers share."""
         capacity = laser_count * BUFFER_KEYSCANS
         if not self._fields or (len(self._fields) == 1 and self._fields[0][1] >= capacity // 2):
             self._fields.append((SurfelField(T_local_base), 0))

@@ -58,12 +58,7 @@ class MapAlignment:
 
 
 def align_map(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment:
-    """Refine a transform between two maps and score it.
-
-    Args:
-        a, b: maps, each in the coordinate frame of its anchor.
-        T_a_b: initial guess, shape (3,), metres and radians.
-    """
+    """Refine a transform (3,) between two maps, each in the coordinate frame of its anchor, and score it."""
     step = max(1, len(b.surface) // (2 * ALIGNED_POINTS))
     sample = b.surface.only(np.arange(0, len(b.surface), step))
     T_a_b = match_scan(sample, a.field, T_a_b, np.zeros((3, 3)), wide_scale_m=ALIGNMENT_SCALE_M).T_field_base
@@ -75,61 +70,44 @@ def align_map(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment:
     return MapAlignment(T_a_b, explained_m, violating_m, max(side.violation for side in sides), known_m)
 
 
-def best_elsewhere(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment | None:
-    """The best alignment of two maps that is not ``T_a_b``, from all headings and all positions.
+def alignments(
+    a: Submap, b: Submap, T_a_b: FloatArray | None = None, headings: FloatArray | None = None
+) -> list[MapAlignment]:
+    """The best alignments of two maps from all headings and positions, the best one first; none if a map is empty.
 
     Args:
         a, b: maps, each in the coordinate frame of its anchor.
-        T_a_b: the transform in question, shape (3,), metres and radians.
-
-    Returns:
-        The alignment; None if a map is empty or no other transform puts a surface on a surface.
+        T_a_b: alignments elsewhere than this transform, shape (3,), are looked for; None: any.
+        headings: headings of b in a, shape (H,), radians, each of which stands for half a turn farther, too; None: all.
     """
-    return next(iter(rivals_of(a, b, T_a_b)), None)
-
-
-def rivals_of(a: Submap, b: Submap, T_a_b: FloatArray) -> list[MapAlignment]:
-    """The alignments of two maps elsewhere than ``T_a_b``, from all headings and positions, the best ones first."""
     if not len(a.surface) or not len(b.surface):
         return []
     middle = b.surface.points.mean(axis=0, keepdims=True)
-    refined = (align_map(a, b, pose) for pose in _distinct_peaks(a, b, middle, [T_a_b]))
-    rivals = (rival for rival in refined if is_elsewhere(rival.T_a_b, T_a_b, middle))
-    return sorted(rivals, key=lambda rival: -rival.score_m)
-
-
-def two_best(
-    a: Submap, b: Submap, headings: FloatArray | None = None
-) -> tuple[MapAlignment, MapAlignment | None] | None:
-    """The best alignment of two maps from all headings and all positions, and the best one elsewhere, if any.
-
-    Args:
-        a, b: maps, each in the coordinate frame of its anchor.
-        headings: headings of b in a, shape (H,), radians, each of which stands for half a turn farther, too; None: all.
-
-    Returns:
-        The two alignments; None if a map is empty.
-    """
-    if not len(a.surface) or not len(b.surface):
-        return None
-    middle = b.surface.points.mean(axis=0, keepdims=True)
-    refined = [align_map(a, b, pose) for pose in _distinct_peaks(a, b, middle, [], headings)]
-    best = max(refined, key=lambda alignment: alignment.score_m)
-    rivals = (rival for rival in refined if is_elsewhere(rival.T_a_b, best.T_a_b, middle))
-    return best, max(rivals, key=lambda rival: rival.score_m, default=None)
-
-
-def _distinct_peaks(
-    a: Submap, b: Submap, middle: FloatArray, known: list[FloatArray], headings: FloatArray | None = None
-) -> list[FloatArray]:
-    """The best transforms of the exhaustive search that are elsewhere than each other and than the ``known`` ones."""
-    distinct = list(known)
+    known = [] if T_a_b is None else [T_a_b]
+    distinct = [*known]
     for pose in _coarse_peaks(a, b, headings):
         if all(is_elsewhere(pose, other, middle) for other in distinct):
             distinct.append(pose)
         if len(distinct) >= REFINED + len(known):
             break
-    return distinct[len(known) :]
+    refined = (align_map(a, b, pose) for pose in distinct[len(known) :])
+    found = [each for each in refined if all(is_elsewhere(each.T_a_b, other, middle) for other in known)]
+    return sorted(found, key=lambda each: -each.score_m)
+
+
+def best_alignment(
+    a: Submap, b: Submap, least_rival_m: float, headings: FloatArray | None = None
+) -> tuple[MapAlignment, float] | None:
+    """The best of the ``alignments``, and the ratio of its score to that of the best one elsewhere.
+
+    The one elsewhere counts as ``least_rival_m`` at least: a few walls are never unique. None if a map is empty.
+    """
+    found = alignments(a, b, headings=headings)
+    if not found:
+        return None
+    best, middle = found[0], b.surface.points.mean(axis=0, keepdims=True)
+    rivals_m = (each.score_m for each in found if is_elsewhere(each.T_a_b, best.T_a_b, middle))
+    return best, best.score_m / max(least_rival_m, next(rivals_m, 0.0))
 
 
 def is_elsewhere(one: FloatArray, other: FloatArray, middle: FloatArray) -> bool:
@@ -143,18 +121,12 @@ def is_elsewhere(one: FloatArray, other: FloatArray, middle: FloatArray) -> bool
 class _Drawing:
     """A map as points around the middle of its surface, metres."""
 
-    surface: FloatArray
-    """Shape (N, 2)."""
-    inside: FloatArray
-    """Centres of the free cells well away from any surface, shape (M, 2)."""
-    middle: FloatArray
-    """Shape (2,), in the map's own coordinates."""
-    reach_m: float
-    """Distance of the farthest of these points."""
-    low: FloatArray
-    """Least x and y of these points, shape (2,)."""
-    high: FloatArray
-    """Largest x and y of these points, shape (2,)."""
+    surface: FloatArray  # (N, 2)
+    inside: FloatArray  # (M, 2): centres of the free cells well away from any surface
+    middle: FloatArray  # (2,), in the map's own coordinates
+    reach_m: float  # distance of the farthest of these points
+    low: FloatArray  # (2,)
+    high: FloatArray  # (2,)
 
 
 def _drawing(submap: Submap) -> _Drawing:

@@ -115,16 +115,12 @@ def verify(
     """Check whether two submaps show the same place: align them in both directions and rate the worse one.
 
     Args:
-        a: one submap, in the coordinate frame of its anchor.
-        b: the other submap, in the coordinate frame of its anchor.
+        a, b: submaps, each in the coordinate frame of its anchor.
         T_a_b_guess: where the Gauss-Newton alignment starts, shape (3,), metres and radians.
         config: thresholds.
         prior: information of the guess from matched keypoints, over (x, y, theta) in the coordinates of a, shape
             (3, 3). It fixes the alignment where no wall does, as along a corridor. It does not make a closure
             informative: structure that repeats along a corridor repeats in images, too.
-
-    Returns:
-        The alignment halfway between both directions, and the gates that it passes.
     """
     return judge(align(a, b, T_a_b_guess, prior), config)
 
@@ -162,13 +158,10 @@ def judge(
 ) -> Verification:
     """Which gates an alignment passes.
 
-    Args:
-        aligned: the alignment.
-        config: thresholds.
-        noise: sum of both submaps' violation of themselves (``self_violation``), called only where it decides. Two
-            submaps cannot agree better than each agrees with itself, so a noisy scanner is allowed as much violation.
-        predicted: whether an estimate predicts the closure. The loose gate decides then, otherwise the strict one. The
-            noise counts for the gate that decides: to measure it takes as long as to build two submaps.
+    ``noise`` is the sum of both submaps' violation of themselves (``self_violation``), called only where it decides: it
+    takes as long as to build two submaps. Two submaps cannot agree better than each agrees with itself, so a noisy
+    scanner is allowed as much violation. Where an estimate has ``predicted`` the closure, the loose gate decides, and
+    else the strict one; the noise counts for the gate that decides.
     """
     worse, weakest = aligned.worse, aligned.worse.weakest
     asymmetric = _asymmetry(aligned.gap)

@@ -213,10 +213,10 @@ class MapLocalizer:
 
     def _contest(self, T_map_base: FloatArray, keyscan: MappedKeyscan) -> None:
         """Give up a doubtful pose if the walls fit clearly better elsewhere."""
-        from fcslam.lidar.uniqueness import align_map, best_elsewhere
+        from fcslam.lidar.uniqueness import align_map, alignments
 
         submap = self._submap(CHECKED_M)
-        rival = best_elsewhere(self._map, submap, T_map_base)
+        rival = next(iter(alignments(self._map, submap, T_map_base)), None)
         if rival is None or rival.violation > MOST_IN_FREE_SPACE:
             return
         here = align_map(self._map, submap, T_map_base)
@@ -234,16 +234,15 @@ class MapLocalizer:
         return build_submap([(k.points, se2.between(newest.T_local_base, k.T_local_base)) for k in kept])
 
     def _search(self, keyscan: MappedKeyscan) -> None:
-        from fcslam.lidar.uniqueness import two_best  # SciPy's transforms take long to load
+        from fcslam.lidar.uniqueness import best_alignment  # SciPy's transforms take long to load
 
         length_m = min(keyscan.travel_m - self._searched_m, LONGEST_STRETCH_M)
         submap = self._submap(length_m)
         self._next_search_m = keyscan.travel_m + max(CHECK_EVERY_M, (STRETCH_GROWTH - 1.0) * length_m)
-        found = two_best(self._map, submap)
+        found = best_alignment(self._map, submap, LEAST_RIVAL_M)
         if found is None:
             return
-        best, rival = found
-        ratio = best.score_m / (LEAST_RIVAL_M if rival is None else max(LEAST_RIVAL_M, rival.score_m))
+        best, ratio = found
         if ratio < LEAST_RATIO or best.violation > MOST_IN_FREE_SPACE:
             return
         self._vote(best.T_a_b, ratio, submap, keyscan)
