@@ -43,7 +43,7 @@ help:
 	@echo "make test-fast    the same without the slow tests"
 	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
 	@echo "make test-all     test and test-system in one run"
-	@echo "make test-training federated training, with attackers and with deployed daemons; run make learning first"
+	@echo "make test-training federated training, with attackers and with real processes; run make learning first"
 	@echo "make test-attack  the tests that play an attacker against own servers on this machine"
 	@echo "make fuzz         broken packets, files, requests and messages; SECONDS=60 of each kind"
 	@echo "make ros-test     install a real ROS 2 as the peer of the tests of live robots"

@@ -62,9 +62,8 @@ from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSett
 from fcslam.learning.code_batches import MOST_POINTS, RevisitExamples, RevisitPair
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.export import export_onnx
-from fcslam.learning.federated.client import FederatedClient, RobotClient
+from fcslam.learning.federated.client import Client, InProcessFleet, RevisitClient
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks, RoundRules
-from fcslam.learning.federated.fleets import InProcessFleet
 from fcslam.learning.federated.held_out import inliers
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.networks import weights_to_network, weights_version
@@ -76,7 +75,6 @@ from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample, draw_pair
 from fcslam.learning.revisits import Keyframe, predict, revisits_in_map
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.trainer import ExecutionOptions
 from fcslam.lidar.scan import point_scan
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.metrics.trajectory import interpolate
@@ -315,7 +313,7 @@ def trained(
         return [None]
     training = settings.training.model_copy(update={"seed": seed})
     settings = settings.model_copy(update={"training": training})
-    start = prepare_initial_weights(BUNDLED_NETWORK, folder, settings.training, ExecutionOptions(), lambda *_: None)
+    start = prepare_initial_weights(BUNDLED_NETWORK, folder, settings.training.encoder)
     learners = [(k, learner) for k, fleet in enumerate(fleets) for learner in fleet.learners]
     steps = settings.rounds * settings.local_steps
     if arm == "central":
@@ -351,14 +349,14 @@ def federated(
     folder: Path,
 ) -> KeypointNetwork:
     """Federated training of all robots; some of them in each round."""
-    clients: list[FederatedClient] = []
+    clients: dict[str, Client] = {}
     (folder / "rounds").mkdir()
     for building, learner in learners:
         name = f"{building}-{learner.robot}"
         (folder / name).mkdir()
-        client = RobotClient(name, folder / name, folder / name, revisits=revisits_of(arm, learner, seed))
+        client = RevisitClient(name, folder / name, revisits=revisits_of(arm, learner, seed))
         is_poisoned = arm == "poisoned" and building in POISONED and learner.robot == LIAR
-        clients.append(PoisonedClient(client, "reversed") if is_poisoned else client)
+        clients[name] = PoisonedClient(client, "reversed") if is_poisoned else client
     hooks = CoordinatorHooks(
         partial(weights_version, encoder=settings.training.encoder),
         on_round=lambda row: print(arm, row.round_number, row.losses, row.left_out, file=sys.stderr, flush=True),

@@ -54,7 +54,6 @@ from fcslam.learning.federated.settings import LIVE_ROUNDS
 from fcslam.learning.labels import Labels
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.revisits import BORDER_PX, FEWEST_SHARED, correspond_predicted
-from fcslam.learning.trainer import ExecutionOptions
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import FloatArray
@@ -111,7 +110,7 @@ def trained(learners: Mapping[str, Learner], folder: Path) -> dict[str, Path]:
     networks = {"bundled": BUNDLED_NETWORK}
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place:
-        start = prepare_initial_weights(BUNDLED_NETWORK, Path(place), training, ExecutionOptions(), lambda *_: None)
+        start = prepare_initial_weights(BUNDLED_NETWORK, Path(place), training.encoder)
         for name, learner in learners.items():
             revisits = RevisitExamples([each.image for each in learner.keyframes], learner.pairs)
             steps = rounds.rounds * rounds.local_steps

@@ -45,17 +45,16 @@ from torch import Tensor
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.learning.batches import POINTS, TrainingBatch
 from fcslam.learning.export import export_onnx
-from fcslam.learning.federated.initial_weights import prepare_initial_weights
+from fcslam.learning.federated.initial_weights import prepare_initial_weights, read_onnx_weights
 from fcslam.learning.federated.networks import weights_to_network
-from fcslam.learning.federated.onnx_weights import read_onnx_weights
 from fcslam.learning.images import ImageFile, find_images
 from fcslam.learning.network import KeypointNetwork, sample_codes
 from fcslam.learning.objective import LOSSES, LossWeights, grid_shift, negatives, objective
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.stages import keypoint_response, read_labelled_images
-from fcslam.learning.trainer import AVERAGE_DECAY, ExecutionOptions
-from fcslam.learning.training_step import CLIP_NORM, create_optimizer, learning_rate
+from fcslam.learning.stages import keypoint_response, label_images, read_images
+from fcslam.learning.trainer import AVERAGE_DECAY
+from fcslam.learning.training_loop import CLIP_NORM, create_optimizer, learning_rate
 
 SOURCES = (
     "bsds500", "coco_subset", "urban100", "sun_hays80", "kodak24", "icl_nuim_snippet", "camvid", "ie_tower",
@@ -192,14 +191,14 @@ def labelled(files: list[ImageFile], cache: Path) -> tuple[list[TrainingExample]
     torch.set_num_threads(1)
     network = weights_to_network(read_onnx_weights(BUNDLED_NETWORK, LABELS.encoder), LABELS.encoder).eval()
     response = keypoint_response(network, torch.device("cpu"))
-    found = read_labelled_images(files, cache, LABELS, response, None, lambda *_: None)
+    found = label_images(read_images(files), cache, LABELS, response)
     return found.train, found.held_out
 
 
 def bundled(start: Path, settings: TrainingSettings, folder: Path, images: list[TrainingExample]) -> KeypointNetwork:
     """A network that comes with fcslam, with the statistics of images."""
     public = [example.image for example in images]
-    weights = prepare_initial_weights(start, folder, settings, ExecutionOptions(), lambda *_: None, public)
+    weights = prepare_initial_weights(start, folder, settings.encoder, public)
     return weights_to_network(weights, settings.encoder)
 
 

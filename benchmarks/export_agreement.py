@@ -37,7 +37,7 @@ def main() -> None:
     scenes = find_scenes([folder / name for name in SCENES])
     exported = OnnxDetector(OnnxConfig(weights=chosen.training / "detector.onnx", most_features=MATCHED))
     with one_thread():
-        trained = _trained(chosen.training / "joint" / "checkpoint.npz", exported.version)
+        trained = _trained(chosen.training / "joint" / "checkpoint.state", exported.version)
         report.table(
             "Bits", BITS, [_bits_row(f"torch and the file, {exported.version}", exported, trained, _images(scenes))]
         )
@@ -53,16 +53,17 @@ def _trained(checkpoint: Path, version: str) -> Network:
     """The checkpoint's network, which must be the one of that version."""
     import torch
 
-    from fcslam.learning.checkpoint import read_checkpoint
     from fcslam.learning.export import detector_version
-    from fcslam.learning.network import KeypointNetwork
-    from fcslam.learning.trainer import AVERAGE
+    from fcslam.learning.network import network_from_state
+    from fcslam.learning.trainer import CHECKPOINT_FORMAT
+    from fcslam.storage.state_file import read_state
 
     torch.set_num_threads(1)
-    trained = read_checkpoint(checkpoint)
-    network = KeypointNetwork(trained.settings["encoder"])
-    network.load_state_dict(trained.part(AVERAGE))
-    network.eval()
+    trained = read_state(checkpoint, CHECKPOINT_FORMAT)
+    if trained is None:
+        sys.exit(f"{checkpoint}: is not there")
+    average = {name: torch.from_numpy(array) for name, array in trained["average"].items()}
+    network = network_from_state(trained["settings"]["encoder"], average)
     if detector_version(network) != version:
         sys.exit(f"{checkpoint}: holds {detector_version(network)}, but detector.onnx is {version}; export it anew")
 

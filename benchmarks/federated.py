@@ -6,11 +6,12 @@ Needs `fcslam[federated]` and `fcslam[sim]`. FOLDER holds all that is trained an
 where it was interrupted. `--until together` leaves out all but
 the comparison itself. Five robots that see different things: a floor of a tower, a drive through a town, photographs
 from the web, and two simulated ones, by day and with lamps off, with few images each, as a robot alone would hardly
-lack others' if it had many. All begin from one small detector that was trained on synthetic shapes and on photographs
-that no robot has, and is far from what longer training makes of it. Central and local training take as many samples as
-all robots together, in steps of two pairs one after another; a robot of a fleet takes a fifth of these steps in every
-arm, in the default's rounds, and so do robots that train alone. Plain is without the server's momentum. Wide is central
-training in as few steps as a robot of the fleet does, each of five times as many pairs, at twice the learning rate:
+lack others' if it had many. All begin from one small detector that was trained anew on photographs that no robot has,
+with Harris's corners as labels, and is far from what longer training makes of it. Central and local training take as
+many samples as all robots together, in steps of two pairs one after another; a robot of a fleet takes a fifth of these
+steps in every arm, in the default's rounds, and so do robots that train alone. Plain is without the server's momentum.
+Wide is central training in as few steps as a robot of the fleet does, each of five times as many pairs, at twice the
+learning rate:
 what it lacks, the fleet lacks for want of steps and not for images that are elsewhere. Pairs are drawn from images that
 no network saw; a robot's own network is shown every fifth of all of them, in turns, so mostly of places where it never
 was; the worst robot is the one whose images an arm does worst on, whoever trained.
@@ -29,7 +30,6 @@ pairs of one image resemble one another, so they are somewhat too narrow; most s
 """
 
 import csv
-import json
 import math
 import sys
 from collections.abc import Iterable, Iterator, Set
@@ -44,6 +44,7 @@ from matplotlib.figure import Figure
 from fcslam.learning.federated.coordinator import RoundRules
 from fcslam.learning.federated.screening import ScreeningBounds
 from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.settings import TrainingSettings
 from fcslam.metrics.bootstrap import mean_interval
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 
 PUBLIC = "sun_hays80"
 """Photographs that the start is trained on."""
-START = {"shape_steps": 400, "steps": 1000, "label_copies": 4, "pairs": 4, "side_px": 128}
+START = TrainingSettings(steps=1000, label_copies=4, pairs=4, side_px=128)
 
 ROUNDS, STEPS = FederatedSettings().rounds, FederatedSettings().local_steps
 TRAINING = {"label_copies": 4, "pairs": 2, "side_px": 128, "learning_rate": 3e-3}
@@ -138,18 +139,17 @@ def study(vision: Path, folder: Path, until: str | None) -> "StudyResults":
 
 def initial(vision: Path, folder: Path) -> Path:
     """The checkpoint that all arms start from, trained unless it is there."""
-    if not (folder / "start" / "detector.onnx").exists():
-        (folder / "start.yaml").write_text(json.dumps(START), encoding="utf-8")
-        common.run_fcslam(
-            "tools", "train", vision / PUBLIC, "--config", folder / "start.yaml", "--output", folder / "start"
-        )
-    return folder / "start" / "joint" / "checkpoint.npz"
+    from fcslam.learning.stages import train_detector
+    from fcslam.learning.trainer import CHECKPOINT_FILE, ExecutionOptions
+
+    train_detector([vision / PUBLIC], folder / "start", START, ExecutionOptions(), None, lambda *_: None)
+    return folder / "start" / "joint" / CHECKPOINT_FILE
 
 
 def setting(findings: "StudyResults", folder: Path) -> str:
     """What was done, in words."""
     measured = [file.stat().st_mtime for file in (folder / "study").glob("seed*/measured/*.npz")]
-    labelled = {name: list((folder / "study" / "labels" / place).rglob("*.npz")) for name, place in places()}
+    labelled = {name: list((folder / "study" / "labels" / place).rglob("*.state")) for name, place in places()}
     first = min(file.stat().st_mtime for files in labelled.values() for file in files)
     images = ", ".join(f"{name} {len(files)}" for name, files in labelled.items())
     return (

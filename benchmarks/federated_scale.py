@@ -3,13 +3,13 @@
     python benchmarks/federated_scale.py [--robots 100] [--rounds 10] [--missing 0.3]
 
 Needs fcslam[federated]. One server, and robots in four processes with a thread each, fetch requests over loopback (no
-TLS; every request is signed with the robot's own key). In each round the server asks 30 % of the robots, drawn anew.
+TLS). In each round the server asks 30 % of the robots, drawn anew.
 Of those, a share is missing: half of these start again after the deadline, as after a loss of power, and half reply
 after it. The weights have the size of the bundled detector. A robot's update is drawn by its name and the round:
-training itself is the robots' own work and is measured elsewhere (`federated_deployed.py`).
+training itself is the robots' own work.
 
 The same fleet runs in one process too, where the missing robots fail at once. Both runs must make the same version in
-every round. CPU is that of the server's process: requests, tokens, screening, merging and checkpoints.
+every round. CPU is that of the server's process: requests, screening, merging and checkpoints.
 """
 
 import argparse
@@ -21,7 +21,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,20 +30,17 @@ import common
 import numpy as np
 
 from fcslam.errors import InputError
-from fcslam.learning.federated.client import ClientUpdate
-from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks, RoundRules
+from fcslam.learning.federated.client import Answer, InProcessFleet
+from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks, RoundRules, TrainingFleet
+from fcslam.learning.federated.evaluation import PUBLIC_IMAGES
 from fcslam.learning.federated.fleet_grid import FleetGrid
 from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
-from fcslam.learning.federated.fleet_server import FleetApp, listening
-from fcslam.learning.federated.fleets import InProcessFleet, TrainingFleet
-from fcslam.learning.federated.held_out import Judgement
-from fcslam.learning.federated.history import RoundReport
+from fcslam.learning.federated.fleet_server import listening
 from fcslam.learning.federated.initial_weights import read_detector_weights
 from fcslam.learning.federated.messages import TrainingRequest
+from fcslam.learning.federated.rounds import RoundReport
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights
-from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
-from fcslam.wire.keys import Credentials
 
 DETECTOR = common.REPOSITORY / "src/fcslam/features/networks/detector.onnx"
 PROCESSES = 4
@@ -69,18 +66,12 @@ class DrawnRobot:
     on_missing: Callable[["DrawnRobot", bool], None]
     """Called in a round in which the robot does not answer in time, with whether it is silent rather than late."""
 
-    def train(self, request: TrainingRequest) -> ClientUpdate:
+    def __call__(self, request: TrainingRequest) -> Answer:
         rng = np.random.default_rng([*self.name.encode(), request.round_number])
         fate = rng.uniform()
         if fate < self.missing:
             self.on_missing(self, fate < self.missing / 2)
-        return ClientUpdate(drawn_update(request.weights, rng, request.round_number), {"drawn": STEP})
-
-    def evaluate(self, _request: TrainingRequest) -> dict[str, float]:
-        raise InputError("has no images")
-
-    def judge(self, _request: TrainingRequest) -> Judgement:
-        raise InputError("has no images")
+        return drawn_update(request.weights, rng, request.round_number), {"drawn": STEP}
 
 
 def drawn_update(weights: Weights, rng: np.random.Generator, round_number: int) -> dict[str, Any]:
@@ -125,8 +116,7 @@ def main() -> None:
 
 def one_process(names: list[str], missing: float, settings: FederatedSettings) -> list[tuple[RoundReport, float]]:
     """The reference."""
-    robots = [DrawnRobot(name, missing, fail) for name in names]
-    return train(InProcessFleet(robots), settings)
+    return train(InProcessFleet({name: DrawnRobot(name, missing, fail) for name in names}), settings)
 
 
 def fail(robot: DrawnRobot, _is_silent: bool) -> None:
@@ -138,10 +128,9 @@ def over_a_network(
 ) -> tuple[list[tuple[RoundReport, float]], float]:
     """Rounds with their CPU seconds, and the server's largest resident set in MB."""
     grid = FleetGrid()
-    app = FleetApp(grid, Authenticator(tuple(map(token_entry, names))), print)
     with (
         socket.create_server(("127.0.0.1", 0)) as listener,
-        listening(app, listener),
+        listening(grid, listener),
         robots(names, missing, listener.getsockname()[1]),
     ):
         end = time.monotonic() + CONNECTING_S
@@ -150,11 +139,6 @@ def over_a_network(
                 sys.exit(f"only {len(grid.robots())} of {len(names)} robots connected")
             time.sleep(0.2)
         return train(grid, settings), peak()
-
-
-def token_entry(name: str) -> TokenEntry:
-    """The token of a robot here is its name."""
-    return TokenEntry(name=name, role=Role.ROBOT, sha256=hashlib.sha256(name.encode()).hexdigest())
 
 
 def train(grid: TrainingFleet, settings: FederatedSettings) -> list[tuple[RoundReport, float]]:
@@ -168,7 +152,7 @@ def train(grid: TrainingFleet, settings: FederatedSettings) -> list[tuple[RoundR
         rounds.append((report, now - spent))
         spent = now
 
-    hooks = CoordinatorHooks(version, lambda _: {"repeatability": 0.5, "mma_3px": 0.5}, note)
+    hooks = CoordinatorHooks(version, lambda _: {PUBLIC_IMAGES: {"repeatability": 0.5, "mma_3px": 0.5}}, note)
     with tempfile.TemporaryDirectory() as folder:
         Coordinator(
             grid, settings, read_detector_weights(DETECTOR, "light"), Path(folder), hooks, RoundRules(judge_every=1)
@@ -217,7 +201,7 @@ def answer(name: str, missing: float, port: int) -> None:
     client = DrawnRobot(name, missing, stay_away)
     while True:
         try:
-            with RobotLink(f"http://127.0.0.1:{port}", name, Credentials(name)) as link:
+            with closing(RobotLink(f"http://127.0.0.1:{port}", name)) as link:
                 serve_requests(link, client, lambda _: None)
         except PowerLossError:
             time.sleep(DEADLINE_S + LATE_S)

@@ -10,7 +10,7 @@ The first tables are of pairs of views of images that these robots held out, in 
 central training, in points, with 95 % by paired bootstrap. Old codes are those of the detector that comes along, in the
 first view of a pair. The last table is of photographs with known homographies that nobody ever trained on, as in
 homography.py, at NMS 8: 25 pairs, one is four points of the homographies. Start is the detector that comes along; its
-normalisations begin by synthetic shapes, as those of a fleet without public images.
+normalisations begin by drawn images, as those of a fleet without public images.
 """
 
 from collections.abc import Iterator
@@ -76,7 +76,7 @@ def exported(folder: Path, arm: str) -> Path:
     from fcslam.learning.federated.networks import weights_to_network
 
     target = folder / f"{arm}.onnx"
-    export_onnx(weights_to_network(read_detector_weights(folder / arm / "checkpoint.npz", "light"), "light"), target)
+    export_onnx(weights_to_network(read_detector_weights(folder / arm / "checkpoint.state", "light"), "light"), target)
     return target
 
 

@@ -13,12 +13,11 @@ from flwr.serverapp.strategy import FedAvg
 
 from fcslam.learning.federated.coordinator import RoundRules
 from fcslam.learning.federated.flower import flower_aggregate
-from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, federate_locally
+from fcslam.learning.federated.job import FederatedJob, federate_locally
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.trainer import ExecutionOptions
 
-TRAINING = TrainingSettings(shape_steps=2, pairs=1, side_px=64, label_copies=1)
+TRAINING = TrainingSettings(pairs=1, side_px=64, label_copies=1)
 SETTINGS = FederatedSettings(rounds=2, local_steps=2, training=TRAINING)
 
 
@@ -35,5 +34,4 @@ class WithoutFurthest(FedAvg):
 
 if __name__ == "__main__":
     job = FederatedJob(Path(sys.argv[1]), SETTINGS, rules=RoundRules(flower_aggregate(WithoutFurthest)))
-    options = ExecutionOptions(validation_pairs=1)
-    print(*federate_locally([Path(folder) for folder in sys.argv[2:]], job, options, ProgressCallbacks()), sep="\n")
+    print(*federate_locally([Path(folder) for folder in sys.argv[2:]], job), sep="\n")

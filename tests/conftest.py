@@ -141,7 +141,6 @@ def brief_validation():
         return
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fcslam.learning.validation.VALIDATION_VIEW", (96, 96))
-        patch.setattr("fcslam.learning.stages.HELD_OUT_SHAPES", 2)
         yield
 
 

@@ -115,7 +115,7 @@ Training on one machine and on several robots has configuration files of its own
 FEDERATED = """\
 ## Federated training
 
-The federated commands read these keys from a YAML file. `training` holds the keys of [Training](#training).
+`fcslam tools federate --config` reads these keys from a YAML file. `training` holds the keys of [Training](#training).
 """
 
 LEARNING = """\

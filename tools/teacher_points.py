@@ -16,8 +16,8 @@ import torch
 from kornia.feature import ALIKED
 
 from fcslam.features.detector import GreyImage
-from fcslam.learning.arrays import write_arrays
 from fcslam.learning.images import find_images, read_image
+from fcslam.storage.files import replacing
 
 MOST_POINTS = 800
 SUPPRESSION_RADIUS_PX = 2
@@ -50,7 +50,9 @@ def write_points(teacher: ALIKED, image: GreyImage, target: Path) -> None:
         "scores": points.keypoint_scores.numpy().astype(np.float32),
         "descriptors": points.descriptors.numpy().astype(np.float16),
     }
-    write_arrays(target, arrays)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(target) as unfinished, unfinished.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """The study of federated training: it compares like with like, resumes, and its arithmetic is right."""
 
-import shutil
-
 import cv2
 import numpy as np
 import pytest
@@ -33,7 +31,7 @@ from tests.learning.federated.fakes import Fake  # noqa: E402
 TINY = {
     "rounds": 2,
     "local_steps": 2,
-    "training": {"shape_steps": 2, "pairs": 1, "side_px": 64, "label_copies": 1},
+    "training": {"pairs": 1, "side_px": 64, "label_copies": 1},
 }
 ARMS = {"averaged": Arm(), "bad": Arm(settings={"strategy": "fedmedian"}, poison="nan")}
 
@@ -76,12 +74,6 @@ def finished(robots, tmp_path_factory):
     return folder, run_study(study(robots, folder))
 
 
-def with_shapes(finished, folder):
-    """A folder in which the weights that all arms start from are trained already."""
-    shutil.copytree(finished[0] / "shapes", folder / "shapes")
-    return folder
-
-
 @pytest.mark.training
 def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_path):
     whole = finished[1]
@@ -119,8 +111,7 @@ def test_robots_own_networks_share_the_pairs_out(finished):
 
 
 @pytest.mark.training
-def test_every_network_sees_as_many_samples(finished, robots, tmp_path):
-    with_shapes(finished, tmp_path)
+def test_every_network_sees_as_many_samples(robots, tmp_path):
     steps = {}
 
     def watch(name, done, of):
@@ -188,8 +179,8 @@ def test_gaps_are_paired_and_the_worst_robot_is_named():
 def test_poison_is_what_it_says(poison):
     before = {"weight": np.zeros(6, np.float32)}
     bad = PoisonedClient(Fake("x", answer=lambda *_: {"weight": np.arange(6, dtype=np.float32)}), poison)
-    request = TrainingRequest(True, before, "v", 0, "run", "images", FederatedSettings())
-    sent = bad.train(request).weights["weight"]
+    request = TrainingRequest(True, before, "v", 0, "run", FederatedSettings())
+    sent = bad(request)[0]["weight"]
     expected = {
         "flipped": -np.arange(6.0),
         "scaled": 10 * np.arange(6.0),

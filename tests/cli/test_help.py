@@ -114,7 +114,6 @@ def completed(line):
     ("line", "offered"),
     [
         ("fcslam ma", ["map"]),
-        ("fcslam tools federate ", ["local", "serve", "join"]),
         ("fcslam map --on", ["--onto"]),
         ("fcslam tools simulate --building of", ["office"]),
         ("fcslam tools extract pho", []),

@@ -34,11 +34,11 @@ def photos(some_photos, tmp_path):
 def first(some_photos, tmp_path_factory, brief_validation):
     """The command of a small run, without its output folder, and the output of one."""
     pytest.importorskip("torch", reason="needs fcslam[train]")
-    from fcslam.learning.training_step import LAST_RATE
+    from fcslam.learning.training_loop import LAST_RATE
 
     folder = tmp_path_factory.mktemp("first")
     (folder / "settings.yaml").write_text(
-        f"{{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, label_copies: 1, learning_rate: {LAST_RATE}}}"
+        f"{{steps: 2, pairs: 1, side_px: 64, label_copies: 1, learning_rate: {LAST_RATE}}}"
     )
     command = ["tools", "train", str(some_photos), "--config", str(folder / "settings.yaml"), "--output"]
     assert main([*command, str(folder / "first")]) == 0
@@ -56,7 +56,7 @@ def complaint(capsys, *arguments):
 def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, capsys):
     pytest.importorskip("torch", reason="needs fcslam[train]")
     settings = tmp_path / "settings.yaml"
-    settings.write_text("{steps: 2, shape_steps: 2, pairs: 1, side_px: 64, label_copies: 1}")
+    settings.write_text("{steps: 2, pairs: 1, side_px: 64, label_copies: 1}")
     output = photos / "out"  # what is in there is no image to train on
     arguments = ["tools", "train", str(photos), "-o", str(output), "--config", str(settings)]
     assert main(arguments) == 0
@@ -85,26 +85,27 @@ def test_images_become_a_detector_and_a_second_call_goes_on(photos, tmp_path, ca
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("file", ["joint/checkpoint.npz", "detector.onnx"])
+@pytest.mark.parametrize("file", ["joint/checkpoint.state", "detector.onnx"])
 def test_training_starts_from_given_weights(file, first, photos, tmp_path, capsys):
     from fcslam.learning.federated.initial_weights import read_detector_weights
-    from fcslam.learning.training_step import LAST_RATE
-    from fcslam.untrusted import read_arrays
+    from fcslam.learning.federated.networks import weights_version
+    from fcslam.learning.training_loop import LAST_RATE
+    from fcslam.storage.state_file import read_state
 
     command, first = first
     second, third = (tmp_path / name for name in ("second", "third"))
     assert main([*command, str(second), "--start", str(first / file)]) == 0
-    assert not (second / "shapes").exists()
-    kept = next(second.glob("start-*.npz"), None)  # of an ONNX file, with statistics of the batches
-    before = read_detector_weights(first / file, "light") if kept is None else read_arrays(kept)
-    after = read_detector_weights(second / "joint" / "checkpoint.npz", "light")
+    before = read_detector_weights(first / file, "light")
+    # Of an ONNX file, with statistics of the batches.
+    before = read_state(second / "start.state", weights_version(before, "light")) or before
+    after = read_detector_weights(second / "joint" / "checkpoint.state", "light")
     kernels = [name for name, array in before.items() if array.ndim == 4]
     # A step of Adam changes no weight by more than the rate, once its moments are those of one sign.
     moved = max(np.abs(after[name] - before[name]).max() for name in kernels)
     assert 0.0 < moved <= 2.1 * LAST_RATE
     capsys.readouterr()
     assert "from another start" in complaint(capsys, *command[2:5], "-o", second, "--start", second / file)
-    assert "is not a checkpoint" in complaint(capsys, photos, "-o", third, "--start", photos / "0.png")
+    assert "0.png: is damaged" in complaint(capsys, photos, "-o", third, "--start", photos / "0.png")
     assert "holds no body" in complaint(capsys, photos, "-o", third, "--start", "vgg")
 
 
@@ -116,7 +117,7 @@ def test_bad_input_is_one_line(photos, tmp_path, capsys):
     assert "holds no image" in complaint(capsys, tmp_path / "empty", "-o", output)
     assert "encoder" in complaint(capsys, photos, "-o", output, "--config", "encoder=huge")
     assert "x.npz" not in complaint(capsys, photos, "-o", output, "--teacher", tmp_path / "empty")
-    assert not (output / "joint" / "checkpoint.npz").exists()
+    assert not (output / "joint" / "checkpoint.state").exists()
 
 
 def test_a_folder_of_no_use_is_one_line(tmp_path, capsys):
@@ -126,8 +127,7 @@ def test_a_folder_of_no_use_is_one_line(tmp_path, capsys):
     cv2.imwrite(str(folder / "wall.png"), 0 * textured(0))
     teacher = tmp_path / "teacher"
     assert "0 of 1 image files" in complaint(capsys, folder, "-o", tmp_path / "out", "--teacher", teacher)
-    assert "0 of 1 image files" in complaint(capsys, folder, "-o", tmp_path / "out")
-    assert not (tmp_path / "out" / "shapes").exists(), "it is said before the training on shapes"
+    assert "no image there is large enough" in complaint(capsys, folder, "-o", tmp_path / "out")
 
 
 def test_without_torch_it_says_what_to_install(photos, tmp_path, capsys, monkeypatch):

@@ -13,8 +13,13 @@ from fcslam.learning.code_batches import RevisitExamples, RevisitPair  # noqa: E
 from fcslam.learning.code_training import CodeInputs, train_codes  # noqa: E402
 from fcslam.learning.federated.initial_weights import read_detector_weights  # noqa: E402
 from fcslam.learning.federated.networks import weights_to_network  # noqa: E402
-from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, layer_names, network_from_state  # noqa: E402
-from fcslam.learning.network import KeypointNetwork, sample_codes  # noqa: E402
+from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan  # noqa: E402
+from fcslam.learning.network import (  # noqa: E402
+    KeypointNetwork,
+    layer_names,
+    network_from_state,
+    sample_codes,
+)
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
 
 pytestmark = pytest.mark.slow

@@ -67,18 +67,6 @@ def test_two_legs_are_one_if_the_second_knows_the_first_ones_moments(examples, s
     assert any(not torch.equal(tensor, expected[name]) for name, tensor in forgetful.network.state_dict().items())
 
 
-def test_moments_that_are_no_numbers_are_given_to_no_other_leg(examples, start, monkeypatch):
-    def overflow(network, optimizer, *_, **__):
-        for value in network.parameters():
-            value.grad = torch.full_like(value, torch.inf)
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimizer.step()
-
-    monkeypatch.setattr("fcslam.learning.local_training.descend", overflow)
-    with pytest.raises(InputError, match="diverged in the last step"):
-        local_training(start, examples, LocalTrainingPlan(SMALL, 0, 1))
-
-
 def test_weights_that_make_training_diverge_are_said(examples, start):
     broken = start | {"body.code_head.1.bias": torch.full_like(start["body.code_head.1.bias"], torch.nan)}
     with pytest.raises(InputError, match="diverged at step 7"):

@@ -25,23 +25,15 @@ def test_images_of_all_folders_are_found_under_their_names(tmp_path):
 
 def test_reading_ends_with_the_last_image_that_is_wanted(tmp_path):
     pytest.importorskip("torch", reason="needs fcslam[train]")
-    from fcslam.learning.settings import TrainingSettings
-    from fcslam.learning.stages import read_labelled_images
+    from fcslam.learning.stages import read_images
 
     write(tmp_path / "x" / "0.png", textured(0)[:20, :20])
     for seed in range(1, 6):
         write(tmp_path / "x" / f"{seed}.png", textured(seed))
-    files, looked_at, settings = find_images([tmp_path / "x"]), [], TrainingSettings(label_copies=0)
-
-    def read(most):
-        found = read_labelled_images(
-            files, tmp_path / "labels", settings, None, None, lambda _stage, status: looked_at.append(status.step), most
-        )
-        return len(found.train), found.skipped
-
-    assert read(2) == (2, 1)
-    assert looked_at == [1, 2, 3]
-    assert read(None) == (5, 1)
+    files = find_images([tmp_path / "x"])
+    for most, count in ((2, 2), (None, 5)):
+        found = read_images(files, most)
+        assert (len(found.images), found.skipped) == (count, 1)
 
 
 def teach(folder, name, size=8, seed=0):
@@ -52,12 +44,12 @@ def teach(folder, name, size=8, seed=0):
     np.savez(folder / f"{name}.npz", keypoints=keypoints, scores=scores, descriptors=rng.normal(size=(20, size)))
 
 
-def labelled_with_teacher(folder):
+def labelled(folder, teacher=None, copies=0, cache="labels"):
     from fcslam.learning.settings import TrainingSettings
-    from fcslam.learning.stages import read_labelled_images
+    from fcslam.learning.stages import label_images, read_images
 
-    files, settings = find_images([folder / "x"]), TrainingSettings(label_copies=0)
-    return read_labelled_images(files, folder / "labels", settings, None, folder / "teacher", lambda *_: None).train
+    found, settings = read_images(find_images([folder / "x"])), TrainingSettings(label_copies=copies)
+    return label_images(found, folder / cache, settings, None, teacher).train
 
 
 def test_files_of_two_teachers_are_refused(tmp_path):
@@ -66,7 +58,7 @@ def test_files_of_two_teachers_are_refused(tmp_path):
         write(tmp_path / "x" / f"{seed}.png", textured(seed))
         teach(tmp_path / "teacher" / "x", f"{seed}.png", size)
     with pytest.raises(InputError, match=r"3\.png\.npz: has descriptors of another size .*8 and 16"):
-        labelled_with_teacher(tmp_path)
+        labelled(tmp_path, tmp_path / "teacher")
 
 
 def test_another_teacher_gives_other_labels(tmp_path):
@@ -74,25 +66,20 @@ def test_another_teacher_gives_other_labels(tmp_path):
     for seed in (1, 2):
         write(tmp_path / "x" / f"{seed}.png", textured(seed))
         teach(tmp_path / "teacher" / "x", f"{seed}.png", seed=1)
-    first, again = (labelled_with_teacher(tmp_path)[0].labels.keypoints for _ in range(2))
+    first, again = (labelled(tmp_path, tmp_path / "teacher")[0].labels.keypoints for _ in range(2))
     teach(tmp_path / "teacher" / "x", "1.png", seed=2)
-    other = labelled_with_teacher(tmp_path)[0].labels.keypoints
+    other = labelled(tmp_path, tmp_path / "teacher")[0].labels.keypoints
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
 
 
 def test_other_settings_of_labels_give_other_labels(tmp_path):
     pytest.importorskip("torch", reason="needs fcslam[train]")
-    from fcslam.learning.settings import TrainingSettings
-    from fcslam.learning.stages import read_labelled_images
-
     for seed in (1, 2):
         write(tmp_path / "x" / f"{seed}.png", textured(seed))
 
     def keypoints(copies, cache):
-        files, settings = find_images([tmp_path / "x"]), TrainingSettings(label_copies=copies)
-        found = read_labelled_images(files, tmp_path / cache, settings, None, None, lambda *_: None)
-        return found.train[0].labels.keypoints
+        return labelled(tmp_path, copies=copies, cache=cache)[0].labels.keypoints
 
     first = keypoints(0, "labels")
     assert np.array_equal(keypoints(3, "labels"), keypoints(3, "new"))

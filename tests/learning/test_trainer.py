@@ -1,6 +1,5 @@
 """The training loop: it learns, resumes as if nothing had happened, keeps what it has, and sounds its alarms."""
 
-import errno
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +23,8 @@ from fcslam.learning.trainer import (  # noqa: E402
     TrainingRun,
     read_curves,
 )
-from fcslam.learning.training_step import learning_rate, reduced_precision  # noqa: E402
+from fcslam.learning.training_loop import learning_rate, reduced_precision  # noqa: E402
 from fcslam.learning.validation import collapse_warnings, validate, validation_pairs  # noqa: E402
-from fcslam.storage.files import replacing  # noqa: E402
 
 CPU_FLAGS = Path("/proc/cpuinfo")
 SMALL = TrainingSettings(steps=6, pairs=1, side_px=64)
@@ -53,7 +51,7 @@ def weights(network):
 def test_a_run_learns(examples, tmp_path):
     longer = SMALL.model_copy(update={"steps": 40, "pairs": 2})
     figures = []
-    TrainingRun(longer, "joint", tmp_path, PACE).train(
+    TrainingRun(longer, tmp_path, PACE).train(
         examples, examples[:1], on_progress=lambda status: figures.append(status.metrics)
     )
     first, last = ([np.mean([row[name] for row in part]) for name in ("detector", "contrastive")]
@@ -64,7 +62,7 @@ def test_a_run_learns(examples, tmp_path):
 @pytest.mark.slow
 def test_an_interrupted_run_ends_as_if_it_had_not_been(examples, tmp_path):
     bits = teacher_bits(torch.from_numpy(examples[0].teacher.descriptors.astype(np.float32)), 1)
-    whole = TrainingRun(SMALL, "joint", tmp_path / "whole", PACE)
+    whole = TrainingRun(SMALL, tmp_path / "whole", PACE)
     (tmp_path / "whole").mkdir()
     (tmp_path / "torn").mkdir()
 
@@ -73,8 +71,8 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(examples, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        TrainingRun(SMALL, "joint", tmp_path / "torn", PACE).train(examples, examples[:1], bits, stop)
-    resumed = TrainingRun(SMALL, "joint", tmp_path / "torn", PACE)
+        TrainingRun(SMALL, tmp_path / "torn", PACE).train(examples, examples[:1], bits, stop)
+    resumed = TrainingRun(SMALL, tmp_path / "torn", PACE)
     steps = []
     torn = resumed.train(examples, examples[:1], bits, lambda status: steps.append(status.step))
     assert steps == [4, 5, 6]
@@ -88,40 +86,23 @@ def test_another_seed_trains_another_network(examples, tmp_path):
         folder = tmp_path / str(seed)
         folder.mkdir()
         settings = SMALL.model_copy(update={"seed": seed, "steps": 1})
-        networks.append(weights(TrainingRun(settings, "joint", folder, PACE).train(examples, examples[:1])))
+        networks.append(weights(TrainingRun(settings, folder, PACE).train(examples, examples[:1])))
     assert not torch.equal(*networks)
-
-
-@pytest.mark.slow
-def test_a_full_disk_leaves_the_last_good_checkpoint(examples, tmp_path, monkeypatch):
-    TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
-    before = (tmp_path / CHECKPOINT_FILE).read_bytes()
-
-    def full(path, content):
-        with replacing(path) as unfinished:
-            unfinished.write_bytes(bytes(content)[:100])
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("fcslam.learning.arrays.write_file", full)
-    with pytest.raises(InputError, match="No space left on device"):
-        TrainingRun(SMALL.model_copy(update={"steps": 8}), "joint", tmp_path, PACE).train(examples, examples[:1])
-    assert (tmp_path / CHECKPOINT_FILE).read_bytes() == before
-    assert [file.name for file in tmp_path.iterdir() if file.suffix == ".partial"] == []
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", b"PK\x03\x04"])
 def test_a_foreign_checkpoint_is_said(examples, tmp_path, content):
     (tmp_path / CHECKPOINT_FILE).write_bytes(content)
-    with pytest.raises(InputError, match=r"checkpoint\.npz: is not a checkpoint"):
-        TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
+    with pytest.raises(InputError, match=r"checkpoint\.state: is damaged"):
+        TrainingRun(SMALL, tmp_path, PACE).train(examples, examples[:1])
 
 
 @pytest.mark.slow
 def test_a_checkpoint_of_other_settings_is_refused_but_more_steps_are_not(examples, tmp_path):
-    TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
+    TrainingRun(SMALL, tmp_path, PACE).train(examples, examples[:1])
     with pytest.raises(InputError, match="other settings"):
-        TrainingRun(SMALL.model_copy(update={"seed": 5}), "joint", tmp_path, PACE).train(examples, examples[:1])
-    more = TrainingRun(SMALL.model_copy(update={"steps": 7}), "joint", tmp_path, PACE)
+        TrainingRun(SMALL.model_copy(update={"seed": 5}), tmp_path, PACE).train(examples, examples[:1])
+    more = TrainingRun(SMALL.model_copy(update={"steps": 7}), tmp_path, PACE)
     more.train(examples, examples[:1])
     assert more.step == 7
 
@@ -179,14 +160,6 @@ def test_the_rate_rises_stays_and_falls():
     assert rates[-1] == pytest.approx(1e-5, rel=0.1)
 
 
-@pytest.mark.parametrize("native", [True, False])
-def test_processors_without_bfloat16_compute_in_float32(native, monkeypatch):
-    monkeypatch.setattr("torch.cpu._is_avx512_bf16_supported", lambda: native)
-    with reduced_precision(torch.device("cpu")):
-        product = torch.ones(2, 2) @ torch.ones(2, 2)
-    assert product.dtype == (torch.bfloat16 if native else torch.float32)
-
-
 @pytest.mark.skipif(not CPU_FLAGS.exists(), reason="needs Linux")
 def test_whether_a_processor_has_bfloat16_is_what_its_kernel_says():
     with reduced_precision(torch.device("cpu")):
@@ -227,5 +200,5 @@ def test_teacher_bits_are_balanced_and_keep_angles():
 @pytest.mark.slow
 def test_a_log_that_a_full_disk_left_empty_gets_its_head(examples, tmp_path):
     (tmp_path / PROGRESS_FILE).touch()
-    TrainingRun(SMALL, "joint", tmp_path, PACE).train(examples, examples[:1])
-    assert read_curves(tmp_path / PROGRESS_FILE, "joint")["detector"][0] == [1, 2, 3, 4, 5, 6]
+    TrainingRun(SMALL, tmp_path, PACE).train(examples, examples[:1])
+    assert read_curves(tmp_path / PROGRESS_FILE)["detector"][0] == [1, 2, 3, 4, 5, 6]

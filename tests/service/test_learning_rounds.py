@@ -3,15 +3,14 @@
 import pytest
 
 from fcslam.errors import InputError
-from fcslam.learning.federated.history import ROUNDS_FILE, RoundReport, write_rows
+from fcslam.learning.federated.rounds import ROUNDS_FILE, Evaluation, RoundReport, write_rows
 from fcslam.service.http import fleet
 from fcslam.service.http.fleet import read_rounds
 
 
 def test_the_table_of_a_training_is_read(tmp_path):
-    first = RoundReport(
-        1, "light-a", ("anna", "bob"), {"cleo": "too late"}, {"triplet": 0.5}, {"mma_3px": 0.25}, 0.4, released=True
-    )
+    judged = Evaluation({"mma_3px": 0.25}, 0.4, released=True)
+    first = RoundReport(1, "light-a", ("anna", "bob"), {"cleo": "too late"}, {"triplet": 0.5}, judged)
     second = RoundReport(2, "light-b", ("bob",), losses={"triplet": float("nan")})
     assert fleet.ROUNDS_FILE == ROUNDS_FILE
     write_rows(tmp_path / ROUNDS_FILE, [first.row(), second.row()])

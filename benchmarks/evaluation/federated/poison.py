@@ -7,8 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.learning.federated.client import ClientUpdate, FederatedClient
-from fcslam.learning.federated.held_out import Judgement
+from fcslam.learning.federated.client import Answer, Client
 from fcslam.learning.federated.messages import TrainingRequest
 from fcslam.learning.federated.weights import FloatVector, Weights, parameter_names, update_vector
 
@@ -21,19 +20,16 @@ SCALE = 10.0
 class PoisonedClient:
     """Trains like another client, and falsifies its update before it leaves."""
 
-    client: FederatedClient
+    client: Client
     poison: Poison
+    name: str = ""
 
-    @property
-    def name(self) -> str:
-        """Name of the other client."""
-        return self.client.name
-
-    def train(self, request: TrainingRequest) -> ClientUpdate:
-        """As in ``FederatedClient``."""
-        trained, weights = self.client.train(request), request.weights
-        names = parameter_names(weights)
-        update = update_vector(trained.weights, weights, names)
+    def __call__(self, request: TrainingRequest) -> Answer:
+        arrays, losses = self.client(request)
+        if not request.is_training:
+            return arrays, losses
+        weights, names = request.weights, parameter_names(request.weights)
+        update = update_vector(arrays, weights, names)
         match self.poison:
             case "flipped":
                 update = -update
@@ -47,15 +43,7 @@ class PoisonedClient:
                 )
             case "nan":
                 update = np.full_like(update, np.nan)
-        return ClientUpdate(apply_update(weights, update, names), trained.losses)
-
-    def evaluate(self, request: TrainingRequest) -> dict[str, float]:
-        """As in ``FederatedClient``."""
-        return self.client.evaluate(request)
-
-    def judge(self, request: TrainingRequest) -> Judgement:
-        """As in ``FederatedClient``."""
-        return self.client.judge(request)
+        return apply_update(weights, update, names), losses
 
 
 def apply_update(old: Weights, update: FloatVector, names: Collection[str]) -> dict[str, NDArray[np.float32]]:

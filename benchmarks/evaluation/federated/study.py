@@ -18,11 +18,9 @@ import torch
 
 from fcslam.config import parse
 from fcslam.features.detector import OnnxConfig, OnnxDetector
-from fcslam.learning.arrays import write_arrays
 from fcslam.learning.export import export_onnx
-from fcslam.learning.federated.client import FederatedClient, RobotClient
+from fcslam.learning.federated.client import Client, ImageClient, InProcessFleet
 from fcslam.learning.federated.coordinator import RULES, Coordinator, CoordinatorHooks, RoundRules
-from fcslam.learning.federated.fleets import InProcessFleet
 from fcslam.learning.federated.flower import flower_aggregate
 from fcslam.learning.federated.initial_weights import prepare_initial_weights
 from fcslam.learning.federated.networks import weights_to_network, weights_version
@@ -32,9 +30,10 @@ from fcslam.learning.images import ImageFile, find_images
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample, ViewPair
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.stages import TrainingImages, keypoint_response, read_labelled_images
+from fcslam.learning.stages import TrainingImages, keypoint_response, label_images, read_images
 from fcslam.learning.trainer import ExecutionOptions, TrainingProgress, TrainingRun
 from fcslam.records import FloatArray
+from fcslam.storage.files import replacing
 from fcslam.untrusted import read_arrays
 
 from .pairs import (
@@ -97,7 +96,7 @@ class Study:
     arms: Mapping[str, Arm]
     """By name; no name begins with that of a built-in arm."""
     start: Path | None = None
-    """Checkpoint or exported detector from which all arms start; None for training on synthetic shapes."""
+    """Checkpoint or exported detector from which all arms start; None for the bundled one."""
     seeds: int = 3
     """Repetitions of each arm, from the same start."""
     local_seeds: int = 1
@@ -157,7 +156,9 @@ def run_study(study: Study) -> StudyResults:
             if not file.exists():
                 common = common or _shared_inputs(study, pairs)
                 networks = _trained(study, common, name, seed)
-                write_arrays(file, {"measures": _measured(networks, pairs, common, seed, study)})
+                file.parent.mkdir(parents=True, exist_ok=True)
+                with replacing(file) as unfinished, unfinished.open("wb") as content:
+                    np.savez(content, measures=_measured(networks, pairs, common, seed, study))
             values.append(read_arrays(file)["measures"])
         measured[name] = np.stack(values)
     owners = tuple(index for index in range(len(study.robots)) for _ in range(share))
@@ -187,16 +188,16 @@ def _spread(files: Sequence[ImageFile], most: int) -> list[ImageFile]:
 def _shared_inputs(study: Study, pairs: Sequence[ViewPair]) -> SharedInputs:
     training = study.federated.client_training()
 
-    def on_progress(stage: str, progress: TrainingProgress) -> None:
-        study.on_progress(stage, progress.step, progress.steps)
+    def on_progress(progress: TrainingProgress) -> None:
+        study.on_progress("labels", progress.step, progress.steps)
 
     device = torch.device(study.options.device)
-    start = prepare_initial_weights(study.start, study.folder, training, study.options, on_progress)
+    start = prepare_initial_weights(study.start, study.folder, training.encoder)
     network = weights_to_network(start, training.encoder)
     labeller = keypoint_response(network.to(device), device)
     images = {
-        robot: read_labelled_images(
-            _files(study, robot)[0], study.folder / "labels", training, labeller, None, on_progress
+        robot: label_images(
+            read_images(_files(study, robot)[0]), study.folder / "labels", training, labeller, None, on_progress
         )
         for robot in study.robots
     }
@@ -229,17 +230,17 @@ def _federated(
 ) -> KeypointNetwork:
     """Train the network of an arm: the one that could be released at its end."""
     folder, encoder = study.folder / f"seed{seed}" / name, settings.training.encoder
-    clients: list[FederatedClient] = [
-        RobotClient(robot, Path(robot), folder / robot, study.options.device, images=own)
+    clients: dict[str, Client] = {
+        robot: ImageClient(robot, folder / robot, study.options.device, images=own)
         for robot, own in common.images.items()
-    ]
+    }
     poison = study.arms[name].poison
     if poison is not None:
-        clients[-1] = PoisonedClient(clients[-1], poison)
+        robot, client = list(clients.items())[-1]
+        clients[robot] = PoisonedClient(client, poison)
     hooks = CoordinatorHooks(
         partial(weights_version, encoder=encoder),
         # Without metrics no version is better than another: the last one counts, as in the other arms.
-        evaluate_fn=lambda _weights: {},
         on_round=lambda report: study.on_progress(f"{name}, seed {seed}", report.round_number, settings.rounds),
     )
     rules = replace(study.arms[name].rules, aggregate=flower_aggregate(settings.strategy))
@@ -270,7 +271,7 @@ def _centrally(
     def on_progress(progress: TrainingProgress) -> None:
         study.on_progress(f"{name}, seed {seed}", progress.step, progress.steps)
 
-    return TrainingRun(training, "joint", folder, quiet, state).train(examples, examples[:1], on_progress=on_progress)
+    return TrainingRun(training, folder, quiet, state).train(examples, examples[:1], on_progress=on_progress)
 
 
 def _measured(

@@ -94,7 +94,7 @@ COMMANDS: dict[str, tuple[str, Callable[..., None] | typer.Typer]] = {
     "tools certificates": (SETUP, certificates.certificates),
     "tools warm-up": (SETUP, warming.warm_up),
     "tools train": (LEARNING, train.train),
-    "tools federate": (LEARNING, federate.app),
+    "tools federate": (LEARNING, federate.federate),
     "tools extract": (LEARNING, extract.extract),
 }
 """Group in the help, and function, of each command. A typer has commands and examples of its own."""
@@ -148,9 +148,7 @@ fcslam tools config paper > paper.yaml
 fcslam tools certificates --host cloud.local --robot robot1 --admin boss
 fcslam tools warm-up
 fcslam tools train photos -o detector
-fcslam tools federate local robot1 robot2 robot3 --public photos -o fleet
-fcslam tools federate serve lab:8000 --insecure --public photos -o fleet
-fcslam tools federate join http://server.lab:8000 images --name robot1 -o home
+fcslam tools federate robot1 robot2 robot3 --public photos -o fleet
 fcslam tools extract photos -o features --keypoints 1000
 """
 """Examples for the help of each command: the lines that begin with it."""

@@ -1,6 +1,5 @@
 """Where commands write: messages on stderr, answers on stdout, and new folders named by the time."""
 
-import math
 from collections.abc import Callable
 from datetime import datetime
 from itertools import count
@@ -44,12 +43,12 @@ def print_line(console: "Console", text: str) -> None:
     console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
-def once_printer(console: "Console", most: float = math.inf) -> Callable[[str], None]:
-    """A function that prints each different line once, and ``most`` of them at most."""
+def once_printer(console: "Console") -> Callable[[str], None]:
+    """A function that prints each different line once."""
     printed = set[str]()
 
     def print_once(line: str) -> None:
-        if line not in printed and len(printed) < most:
+        if line not in printed:
             printed.add(line)
             print_line(console, line)
 

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from fcslam.learning.network import KeypointNetwork
     from fcslam.learning.settings import TrainingSettings
     from fcslam.learning.stages import StageCallback
-    from fcslam.learning.trainer import ExecutionOptions, TrainingProgress
+    from fcslam.learning.trainer import TrainingProgress
 
-QUICK = {"steps": 20, "shape_steps": 20, "pairs": 2, "side_px": 96, "label_copies": 2}
+QUICK = {"steps": 20, "pairs": 2, "side_px": 96, "label_copies": 2}
 """Settings of ``--quick``: every stage runs, none long enough to learn much."""
 FIGURES = ("repeatability", "mma_3px")
 
@@ -64,7 +64,7 @@ def train(
             teacher,
             watch,
             QUICK_IMAGES if quick else None,
-            None if start is None else _start_network(start, output, settings, options, images),
+            None if teacher is not None and start is None else _start_network(start, output, settings, images),
         )
     files = write_artifacts(network, output, "training.png", settings, training_report(output, found, teacher))
     for file in files:
@@ -75,13 +75,13 @@ def train(
 
 
 def _start_network(
-    start: Path, output: Path, settings: "TrainingSettings", options: "ExecutionOptions", images: list[Path]
+    start: Path | None, output: Path, settings: "TrainingSettings", images: list[Path]
 ) -> "KeypointNetwork":
     from fcslam.learning.federated.initial_weights import prepare_initial_weights
     from fcslam.learning.federated.networks import weights_to_network
-    from fcslam.learning.federated.public_images import read_public_images
+    from fcslam.learning.images import read_usable_images
 
-    weights = prepare_initial_weights(start, output, settings, options, lambda *_: None, read_public_images(images))
+    weights = prepare_initial_weights(start, output, settings.encoder, read_usable_images(images))
     return weights_to_network(weights, settings.encoder)
 
 

@@ -20,8 +20,8 @@ TRAINING_OUTPUT = "Folder for everything that training writes. If it holds an un
 Start = Annotated[
     Path | None,
     typer.Option(
-        help="Weights to start from: a checkpoint.npz, a detector.onnx, or vgg, which comes with fcslam.",
-        show_default="training on synthetic shapes",
+        help="Weights to start from: a checkpoint.state, a detector.onnx, or vgg, which comes with fcslam.",
+        show_default="the network that comes with fcslam",
     ),
 ]
 Quick = Annotated[bool, typer.Option("--quick", help="Train for about a minute, only to check that everything works.")]

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Generator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from typing import Self
 
@@ -85,17 +85,15 @@ def collate(pairs: Sequence[ViewPair]) -> TrainingBatch:
 
 
 def batch_stream(
-    examples: Sequence[TrainingExample], settings: TrainingSettings, first: int, ahead: int, threads: int
-) -> Generator[tuple[int, TrainingBatch], None, None]:
-    """Step numbers and batches from step ``first``, in order; ``threads`` threads prepare up to ``ahead`` of them."""
+    examples: Sequence[TrainingExample], settings: TrainingSettings, steps: range, ahead: int, threads: int
+) -> Generator[TrainingBatch, None, None]:
+    """The batches of these steps, in order; ``threads`` threads prepare up to ``ahead`` of them."""
     with ThreadPoolExecutor(threads) as pool:
-        waiting: deque[Future[TrainingBatch]] = deque()
-        asked = first
+        waiting = deque(pool.submit(draw_batch, examples, settings, step) for step in steps[:ahead])
         try:
-            for step in range(first, settings.steps):
-                while asked < min(step + ahead, settings.steps):
-                    waiting.append(pool.submit(draw_batch, examples, settings, asked))
-                    asked += 1
-                yield step, waiting.popleft().result()
+            for step in steps:
+                yield waiting.popleft().result()
+                if step + ahead < steps.stop:
+                    waiting.append(pool.submit(draw_batch, examples, settings, step + ahead))
         finally:
             pool.shutdown(wait=False, cancel_futures=True)

@@ -16,16 +16,10 @@ from torch import Tensor
 from fcslam.errors import InputError
 from fcslam.features.detector import GreyImage
 from fcslam.learning.code_batches import RevisitExamples, draw_rehearsal, draw_revisits, draw_views
-from fcslam.learning.local_training import (
-    LocalTrainingPlan,
-    LocalTrainingResult,
-    layer_names,
-    network_from_state,
-    train_layers,
-)
-from fcslam.learning.network import Description, KeypointNetwork
+from fcslam.learning.local_training import LocalTrainingPlan, LocalTrainingResult, train_layers
+from fcslam.learning.network import Description, KeypointNetwork, layer_names, network_from_state
 from fcslam.learning.objective import REHEARSAL_WEIGHT, rehearsal_loss, revisit_objective
-from fcslam.learning.training_step import reduced_precision
+from fcslam.learning.training_loop import reduced_precision
 
 _IMAGES_AT_ONCE: Final = 8
 

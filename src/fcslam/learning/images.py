@@ -69,6 +69,15 @@ def is_usable(image: GreyImage) -> bool:
     return len(cv2.FastFeatureDetector.create(threshold=CORNER_CONTRAST).detect(image)) >= FEWEST_CORNERS
 
 
+def read_usable_images(roots: Sequence[Path]) -> list[GreyImage]:
+    """The images below folders that can be trained on, at least one."""
+    images = [image for file in find_images(roots) if (image := read_image(file.path)) is not None]
+    usable = [image for image in images if is_usable(image)]
+    if not usable:
+        raise InputError(f"{roots[0]}: no image there is large enough and has enough corners; give more images")
+    return usable
+
+
 def is_held_out(name: str) -> bool:
     """Whether the image of this name is kept for validation: the same on every machine, whatever else is there."""
     return zlib.crc32(name.encode()) < HELD_OUT_SHARE * 2**32

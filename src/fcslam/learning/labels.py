@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from fcslam.errors import InputError
-from fcslam.learning.arrays import write_arrays
+from fcslam.errors import InputError, writing
+from fcslam.storage.state_file import read_state, write_state
 from fcslam.untrusted import read_arrays
 
 SAME_POINT_PX: Final = 3.0
@@ -88,17 +88,19 @@ def is_finite(array: NDArray[np.generic]) -> bool:
 
 
 def write_labels(path: Path, labels: Labels, key: int) -> None:
-    """Write labels for later runs; ``key`` identifies the image."""
-    write_arrays(path, {"keypoints": labels.keypoints, "quality": labels.quality, "key": np.array(key)})
+    """Write labels for later runs; ``key`` identifies the image and how it was labelled."""
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_state(path, f"labels {key}", {"keypoints": labels.keypoints, "quality": labels.quality})
 
 
 def read_labels(path: Path, key: int) -> Labels | None:
     """The labels of the image with this key; None if the file does not hold them."""
     try:
-        arrays = read_arrays(path)
-        return Labels(arrays["keypoints"], arrays["quality"]) if int(arrays["key"]) == key else None
-    except (OSError, ValueError, KeyError, TypeError):
+        found = read_state(path, f"labels {key}")
+    except InputError:
         return None
+    return None if found is None else Labels(**found)
 
 
 def _suppress(points: Points, score: NDArray[np.float64]) -> NDArray[np.int64]:

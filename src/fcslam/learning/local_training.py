@@ -10,24 +10,20 @@ from torch import Tensor, nn
 
 from fcslam.errors import InputError
 from fcslam.learning.batches import batch_stream
-from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.objective import LOSSES
+from fcslam.learning.network import KeypointNetwork, layer_names, network_from_state
 from fcslam.learning.pairs import TrainingExample
-from fcslam.learning.settings import Encoder, TrainingSettings
-from fcslam.learning.training_step import (
+from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.training_loop import (
+    LossesOf,
     create_optimizer,
     descend,
     get_optimizer_state,
-    learning_rate,
     restore_optimizer_state,
     step_losses,
 )
 
 RAMP_STEPS: Final = 10
 """Steps over which the learning rate rises of a new optimizer: without moments, Adam only follows gradients' signs."""
-
-LossesOf = Callable[[int], tuple[Tensor, dict[str, Tensor]]]
-"""Gives the loss to descend at a step of the whole run, and its parts by name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +40,11 @@ class LocalTrainingPlan:
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     on_step: Callable[[int], None] = lambda _steps: None
     """Called with the number of steps done."""
+
+    @property
+    def numbers(self) -> range:
+        """Of the steps, over the whole run."""
+        return range(self.first_step, self.first_step + self.steps)
 
 
 class LocalTrainingResult(NamedTuple):
@@ -66,12 +67,10 @@ def local_training(
     settings, device = plan.settings, plan.device
     network = network_from_state(settings.encoder, start).to(device, memory_format=torch.channels_last)
     network.train()
-    until = settings.model_copy(update={"steps": plan.first_step + plan.steps})
-    batches = batch_stream(examples, until, plan.first_step, ahead=2, threads=1)
+    batches = batch_stream(examples, settings, plan.numbers, ahead=2, threads=1)
 
     def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
-        _, batch = next(batches)
-        return step_losses(network, batch.to(device), settings, step, LOSSES[settings.losses])
+        return step_losses(network, next(batches).to(device), settings, step)
 
     with closing(batches):
         return _descended(network, losses_of, plan)
@@ -91,40 +90,22 @@ def train_layers(
 def _descended(network: KeypointNetwork, losses_of: LossesOf, plan: LocalTrainingPlan) -> LocalTrainingResult:
     """The network after the steps of the plan, in evaluation mode."""
     optimizer = create_optimizer(network)
+    is_new = plan.optimizer_state is None
     if plan.optimizer_state is not None:
         try:
             restore_optimizer_state(optimizer, plan.optimizer_state)
         except (KeyError, ValueError) as error:
             raise InputError(f"the optimizer cannot continue ({error})") from error
     sums: dict[str, float] = {}
-    for done in range(1, plan.steps + 1):
-        step = plan.first_step + done - 1
-        ramp = min(done / RAMP_STEPS, 1.0) if plan.optimizer_state is None else 1.0
-        total, losses = losses_of(step)
-        descend(network, optimizer, total, step, ramp * learning_rate(plan.settings, step))
+    for step, losses in descend(
+        network, optimizer, losses_of, plan.settings, plan.numbers, RAMP_STEPS if is_new else 0
+    ):
         for name, loss in losses.items():
             sums[name] = sums.get(name, 0.0) + float(loss.detach())
-        plan.on_step(done)
+        plan.on_step(step + 1 - plan.first_step)
     network.eval()
     state = get_optimizer_state(optimizer)
     if not all(bool(torch.isfinite(value).all()) for value in state.values()):
         # Checked here, because whatever continues from this state would diverge.
         raise InputError("training diverged in the last step; lower the learning rate")
     return LocalTrainingResult(network, {name: total / plan.steps for name, total in sums.items()}, state)
-
-
-def layer_names(network: KeypointNetwork, layers: Sequence[nn.Module]) -> set[str]:
-    """Names of the parameters and statistics of some layers of a network."""
-    values = {id(value) for layer in layers for value in layer.state_dict(keep_vars=True).values()}
-    return {name for name, value in network.state_dict(keep_vars=True).items() if id(value) in values}
-
-
-def network_from_state(encoder: Encoder, state: Mapping[str, Tensor]) -> KeypointNetwork:
-    """A network in this state, in evaluation mode."""
-    network = KeypointNetwork(encoder)
-    try:
-        network.load_state_dict(dict(state))
-    except RuntimeError as error:
-        raise InputError(f"the weights are not those of a {encoder} network ({error})") from error
-    network.eval()
-    return network

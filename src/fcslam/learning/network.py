@@ -10,12 +10,14 @@ All resampling is symmetric about the centre of a pixel block. So cell (r, c) of
 (8 c + 3.5, 8 r + 3.5), where (0, 0) is the centre of the first pixel.
 """
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from fcslam.errors import InputError
 from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX
 from fcslam.learning.settings import Encoder
@@ -67,6 +69,23 @@ class KeypointNetwork(nn.Module):
         if self.encoder == "light":
             return maps.point_logits.sigmoid()
         return cell_probabilities(maps.point_logits)
+
+
+def layer_names(network: KeypointNetwork, layers: Sequence[nn.Module]) -> set[str]:
+    """Names of the parameters and statistics of some layers of a network."""
+    values = {id(value) for layer in layers for value in layer.state_dict(keep_vars=True).values()}
+    return {name for name, value in network.state_dict(keep_vars=True).items() if id(value) in values}
+
+
+def network_from_state(encoder: Encoder, state: Mapping[str, Tensor]) -> KeypointNetwork:
+    """A network in this state, in evaluation mode."""
+    network = KeypointNetwork(encoder)
+    try:
+        network.load_state_dict(dict(state))
+    except RuntimeError as error:
+        raise InputError(f"the weights are not those of a {encoder} network ({error})") from error
+    network.eval()
+    return network
 
 
 class LightBody(nn.Module):

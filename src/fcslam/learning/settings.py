@@ -18,9 +18,6 @@ class TrainingSettings(Settings):
 
     encoder: Encoder = Field(default="light", description="encoder of the network: light, or vgg as in the paper")
     steps: int = Field(default=20_000, ge=1, description="optimizer steps of the joint training on images")
-    shape_steps: int = Field(
-        default=5_000, ge=1, description="optimizer steps on synthetic shapes before; not used with a teacher"
-    )
     label_copies: int = Field(
         default=16, ge=0, description="warped copies of an image over which its keypoint labels are averaged"
     )

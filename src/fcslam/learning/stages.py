@@ -1,8 +1,8 @@
-"""From a folder of images to a trained network: shapes, labels, joint training. Each stage can be resumed.
+"""From a folder of images to a trained network: labels and training. Both can be resumed.
 
-Without a teacher, a detector labels the images by homographic adaptation, together with Harris's measure: the one from
-which training starts, or one that first learns corners on synthetic shapes. With a teacher, the teacher's keypoints
-replace those of this detector, and its descriptors determine the wanted bits.
+Without a teacher, the network from which training starts labels the images by homographic adaptation, together with
+Harris's measure. With a teacher, the teacher's keypoints replace those of this network, and its descriptors determine
+the wanted bits.
 """
 
 import zlib
@@ -10,12 +10,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, overload
+from typing import Final
 
 import numpy as np
 import torch
 
-from fcslam.errors import InputError, writing
+from fcslam.errors import InputError
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
 from fcslam.learning.artifacts import Curve, Panel, TrainingReport
@@ -24,25 +24,27 @@ from fcslam.learning.homographic_adaptation import Response, adapt, harris, peak
 from fcslam.learning.images import ImageFile, find_images, is_held_out, is_usable, read_image
 from fcslam.learning.labels import MOST_POINTS, Labels, Teacher, fuse_keypoints, read_labels, read_teacher, write_labels
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.objective import LossWeights, TeacherBits, teacher_bits
+from fcslam.learning.objective import TeacherBits, teacher_bits
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.synthetic_shapes import draw_shapes
 from fcslam.learning.trainer import PROGRESS_FILE, ExecutionOptions, TrainingProgress, TrainingRun, read_curves
 
 LABEL_NMS_PX: Final = 4.0
 DESCRIPTORS_OF_AN_IMAGE: Final = 32
 """Descriptors of each image to which the projection of a teacher's descriptors is fitted."""
 FEWEST_IMAGES: Final = 2
-SHAPE_COUNT: Final = 1_000_000
-"""Number of different synthetic shapes, more than any training draws."""
-HELD_OUT_SHAPES: Final = 32
-SHAPE_SIDE_PX: Final = 240
-SHAPE_LOSSES: Final = LossWeights(triplet=0.0, contrastive=0.0, distillation=0.0, balance=0.0)
-"""Only the keypoint maps are trained on shapes: descriptors would learn nothing useful there."""
 
 StageCallback = Callable[[str, TrainingProgress], None]
 """Called with the name of a stage and its progress."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadImages:
+    """The usable images of a folder."""
+
+    images: Sequence[tuple[ImageFile, GreyImage]]
+    skipped: int
+    """Number of files that are not images, too small, or have too few corners."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,26 +72,6 @@ class TrainingImages:
         return key
 
 
-class SyntheticShapes(Sequence[TrainingExample]):
-    """Synthetic shapes; the same index always gives the same picture."""
-
-    def __init__(self, first: int, count: int) -> None:
-        self._first, self._count = first, count
-
-    def __len__(self) -> int:
-        return self._count
-
-    @overload
-    def __getitem__(self, index: int) -> TrainingExample: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[TrainingExample]: ...
-    def __getitem__(self, index: int | slice) -> TrainingExample | Sequence[TrainingExample]:
-        if isinstance(index, slice):
-            return [self[position] for position in range(*index.indices(self._count))]
-        rng = np.random.default_rng([self._first, index])
-        return TrainingExample(*draw_shapes(SHAPE_SIDE_PX, SHAPE_SIDE_PX, rng))
-
-
 def train_detector(
     roots: Sequence[Path],
     folder: Path,
@@ -115,93 +97,75 @@ def train_detector(
         The trained network, and the images that it was trained on.
     """
     own = folder.resolve()
-    files = [file for file in find_images(roots) if not file.path.resolve().is_relative_to(own)]
-    _check_usable(files)
-    first, device = start, torch.device(options.device)
-    if first is None and teacher is None:
-        first = train_on_shapes(folder / "shapes", settings, options, on_progress)
-    detector = None if first is None or teacher is not None else keypoint_response(first.to(device), device)
-    images = read_labelled_images(files, folder / "labels", settings, detector, teacher, on_progress, most_images)
-    key = images.checksum()
+    found = read_images(
+        [file for file in find_images(roots) if not file.path.resolve().is_relative_to(own)], most_images
+    )
+    labeller = None if start is None else keypoint_response(start.to(options.device), torch.device(options.device))
+    images = label_images(found, folder / "labels", settings, labeller, teacher, partial(on_progress, "labels"))
+    key, state = images.checksum(), None
     if start is not None:
-        key = zlib.crc32(detector_version(start).encode(), key)
-    state = None if first is None else first.state_dict()
-    run = TrainingRun(settings, "joint", folder / "joint", options, state, key)
-    return run.train(
-        images.train,
-        images.held_out,
-        _teacher_bits(images.train, settings.seed),
-        on_progress=partial(on_progress, "joint"),
-    ), images
+        key, state = zlib.crc32(detector_version(start).encode(), key), start.state_dict()
+    run = TrainingRun(settings, folder / "joint", options, state, key)
+    bits = _teacher_bits(images.train, settings.seed)
+    return run.train(images.train, images.held_out, bits, partial(on_progress, "joint")), images
 
 
-def read_labelled_images(
-    files: Sequence[ImageFile],
+def read_images(files: Sequence[ImageFile], most: int | None = None) -> ReadImages:
+    """Read images; ends with the last of the ``most`` ones to train on. None for all."""
+    found: list[tuple[ImageFile, GreyImage]] = []
+    train = skipped = 0
+    for file in files:
+        image = read_image(file.path)
+        if image is None or not is_usable(image):
+            skipped += 1
+            continue
+        found.append((file, image))
+        train += not is_held_out(file.name)
+        if train == most:
+            break
+    if train < FEWEST_IMAGES:
+        raise InputError(
+            f"only {train} of {len(files)} image files can be trained on: the others are not images, smaller than "
+            "96 px or have too few corners; give more images"
+        )
+    return ReadImages(found, skipped)
+
+
+def label_images(
+    found: ReadImages,
     cache: Path,
     settings: TrainingSettings,
-    detector: Callable[[GreyImage], Response] | None,
-    teacher: Path | None,
-    on_progress: StageCallback,
-    most: int | None = None,
+    labeller: Callable[[GreyImage], Response] | None,
+    teacher: Path | None = None,
+    on_progress: Callable[[TrainingProgress], None] = lambda _progress: None,
 ) -> TrainingImages:
-    """Read images, and label those that have no labels in ``cache`` yet.
+    """Label images that have no labels in ``cache`` yet.
 
     Args:
-        files: of the images.
+        found: the images.
         cache: folder of the labels.
         settings: of the run.
-        detector: gives the response by which images are labelled, beside Harris's measure; None for that alone.
-        teacher: folder of a teacher's files, whose keypoints replace the detector's; None without a teacher.
+        labeller: gives the response by which images are labelled, beside Harris's measure; None for that alone.
+        teacher: folder of a teacher's files, whose keypoints replace those of the labeller; None without a teacher.
         on_progress: called after every image.
-        most: usable images to train on; reading ends with the last of them. None for all.
     """
     train: list[TrainingExample] = []
     held_out: list[TrainingExample] = []
-    skipped = 0
     sizes: set[int] = set()
-    for index, file in enumerate(files):
-        image = read_image(file.path)
-        if image is not None and is_usable(image):
-            teacher_of_image = None
-            if teacher is not None:
-                teacher_of_image = read_teacher(teacher / f"{file.name}.npz")
-                sizes.add(teacher_of_image.descriptors.shape[1])
-                if len(sizes) > 1:
-                    raise InputError(
-                        f"{teacher / file.name}.npz: has descriptors of another size than the files before "
-                        f"({' and '.join(map(str, sorted(sizes)))}); make all files with one teacher"
-                    )
-            place = cache / f"{file.name}.npz"
-            (held_out if is_held_out(file.name) else train).append(
-                TrainingExample(image, _labels(image, place, settings, detector, teacher_of_image), teacher_of_image)
-            )
-        else:
-            skipped += 1
-        missing = len(files) if most is None else most - len(train)
-        on_progress("labels", TrainingProgress(index + 1, min(index + 1 + missing, len(files)), {}))
-        if len(train) == most:
-            break
-    if len(train) < FEWEST_IMAGES:
-        raise _too_few(len(train), len(files))
-    return TrainingImages(train, held_out or train[:1], skipped)
-
-
-def _check_usable(files: Sequence[ImageFile]) -> None:
-    """Look before the long work whether there are enough images."""
-    usable = 0
-    for file in files:
-        image = read_image(file.path)
-        usable += image is not None and is_usable(image) and not is_held_out(file.name)
-        if usable >= FEWEST_IMAGES:
-            return
-    raise _too_few(usable, len(files))
-
-
-def _too_few(usable: int, files: int) -> InputError:
-    return InputError(
-        f"only {usable} of {files} image files can be trained on: the others are not images, smaller than 96 px or "
-        "have too few corners; give more images"
-    )
+    for index, (file, image) in enumerate(found.images):
+        taught = None
+        if teacher is not None:
+            taught = read_teacher(teacher / f"{file.name}.npz")
+            sizes.add(taught.descriptors.shape[1])
+            if len(sizes) > 1:
+                raise InputError(
+                    f"{teacher / file.name}.npz: has descriptors of another size than the files before "
+                    f"({' and '.join(map(str, sorted(sizes)))}); make all files with one teacher"
+                )
+        labels = _labels(image, cache / f"{file.name}.state", settings, labeller, taught)
+        (held_out if is_held_out(file.name) else train).append(TrainingExample(image, labels, taught))
+        on_progress(TrainingProgress(index + 1, len(found.images), {}))
+    return TrainingImages(train, held_out or train[:1], found.skipped)
 
 
 def _labels(
@@ -230,26 +194,8 @@ def _labels(
     else:
         others = corners
     labels = fuse_keypoints(corners, others)
-    with writing(place):
-        write_labels(place, labels, key)
+    write_labels(place, labels, key)
     return labels
-
-
-def train_on_shapes(
-    folder: Path, settings: TrainingSettings, options: ExecutionOptions, on_progress: StageCallback
-) -> KeypointNetwork:
-    """Train a detector of the corners of synthetic shapes; its descriptors are not trained yet.
-
-    ``folder`` is for the files of this stage, which is continued if it is in there.
-    """
-    shapes = settings.model_copy(update={"steps": settings.shape_steps})
-    run = TrainingRun(shapes, "shapes", folder, options)
-    return run.train(
-        SyntheticShapes(0, SHAPE_COUNT),
-        SyntheticShapes(1, HELD_OUT_SHAPES),
-        weights=SHAPE_LOSSES,
-        on_progress=partial(on_progress, "shapes"),
-    )
 
 
 def _teacher_bits(examples: Sequence[TrainingExample], seed: int) -> TeacherBits | None:
@@ -286,7 +232,7 @@ SHOWN_METRICS: Final = {
 
 def training_report(folder: Path, images: TrainingImages, teacher: Path | None) -> TrainingReport:
     """The report of a run in a folder, for its card and picture."""
-    curves = read_curves(folder / "joint" / PROGRESS_FILE, "joint")
+    curves = read_curves(folder / "joint" / PROGRESS_FILE)
     held_out = f"{len(images.held_out)} others were held out" if images.are_held_out else "none was held out"
     facts = [
         f"Trained on {len(images.train)} images; {held_out}, {images.skipped} left out.",

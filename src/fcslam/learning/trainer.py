@@ -6,9 +6,10 @@ A step depends on the seed, its number and the state before it. So a run that wa
 import csv
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import torch
 from torch import Tensor
@@ -16,27 +17,25 @@ from torch import Tensor
 from fcslam.errors import InputError, writing
 from fcslam.learning.artifacts import Curve
 from fcslam.learning.batches import batch_stream
-from fcslam.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.objective import LOSSES, LossWeights, TeacherBits
+from fcslam.learning.objective import TeacherBits
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.training_step import (
+from fcslam.learning.training_loop import (
     create_optimizer,
     descend,
     get_optimizer_state,
-    learning_rate,
     restore_optimizer_state,
     step_losses,
 )
 from fcslam.learning.validation import VALIDATION_PAIRS, collapse_warnings, validate, validation_pairs
+from fcslam.storage.state_file import State, read_state, write_state
 
 AVERAGE_DECAY: Final = 0.999
 """Share of the averaged network that a step keeps; early steps keep less, so that it forgets the initial network."""
-CHECKPOINT_FILE: Final = "checkpoint.npz"
+CHECKPOINT_FILE: Final = "checkpoint.state"
+CHECKPOINT_FORMAT: Final = "fcslam training 2"
 PROGRESS_FILE: Final = "progress.csv"
-NETWORK, AVERAGE, OPTIMIZER = "network/", "average/", "optimizer/"
-"""Prefixes of the names of tensors in a checkpoint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,19 +70,18 @@ class TrainingProgress:
 
 
 class TrainingRun:
-    """One stage of training in a folder. It continues from the checkpoint there."""
+    """Training in a folder. It continues from the checkpoint there."""
 
     def __init__(
         self,
         settings: TrainingSettings,
-        stage: str,
         folder: Path,
         options: ExecutionOptions,
         start: dict[str, Tensor] | None = None,
         examples: int = 0,
     ) -> None:
         """``examples`` is a checksum of what is trained on and from; a checkpoint of something else is refused."""
-        self.settings, self.stage, self.folder, self.options = settings, stage, folder, options
+        self.settings, self.folder, self.options = settings, folder, options
         self.device = torch.device(options.device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -105,41 +103,40 @@ class TrainingRun:
         held_out: Sequence[TrainingExample],
         bits: TeacherBits | None = None,
         on_progress: Callable[[TrainingProgress], None] = lambda _progress: None,
-        weights: LossWeights | None = None,
     ) -> KeypointNetwork:
-        """Train to the last step; returns the averaged network.
-
-        ``bits`` are a teacher's, if the examples have one; ``weights`` replace those that the settings name.
-        """
+        """Train to the last step; returns the averaged network. ``bits`` are a teacher's, if the examples have one."""
+        settings, options = self.settings, self.options
         with writing(self.folder, "choose another output folder"):
             self.folder.mkdir(parents=True, exist_ok=True)
         self._resume()
         bits = None if bits is None else bits.to(self.device)
-        weights = weights or LOSSES[self.settings.losses]
-        views = validation_pairs(held_out, self.options.validation_pairs)
+        views = validation_pairs(held_out, options.validation_pairs)
         metrics: dict[str, float] = {}
         warnings: tuple[str, ...] = ()
-        for step, batch in batch_stream(
-            examples, self.settings, self.step, 4 * self.options.threads, self.options.threads
-        ):
-            self.network.train()
-            total, parts = step_losses(self.network, batch.to(self.device), self.settings, step, weights, bits)
-            descend(self.network, self.optimizer, total, step, learning_rate(self.settings, step))
-            self._average(step)
-            self.step = step + 1
-            last = self.step == self.settings.steps
-            if self.step % self.options.log_every == 0 or last:
-                losses = {name: float(part.detach()) for name, part in parts.items()}
-                metrics |= losses
-                self._log(losses)
-            if self.step % self.options.validate_every == 0 or last:
-                found = validate(self.average, views, self.device)
-                metrics |= found
-                warnings = tuple(collapse_warnings(found))
-                self._log(found | {"alarms": float(len(warnings))})
-            if last or time.monotonic() - self._saved > self.options.checkpoint_every_s:
-                self._save()
-            on_progress(TrainingProgress(self.step, self.settings.steps, dict(metrics), warnings))
+        steps = range(self.step, settings.steps)
+        batches = batch_stream(examples, settings, steps, 4 * options.threads, options.threads)
+
+        def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
+            return step_losses(self.network, next(batches).to(self.device), settings, step, bits)
+
+        self.network.train()
+        with closing(batches):
+            for step, parts in descend(self.network, self.optimizer, losses_of, settings, steps):
+                self._average(step)
+                self.step = step + 1
+                last = self.step == settings.steps
+                if self.step % options.log_every == 0 or last:
+                    losses = {name: float(part.detach()) for name, part in parts.items()}
+                    metrics |= losses
+                    self._log(losses)
+                if self.step % options.validate_every == 0 or last:
+                    found = validate(self.average, views, self.device)
+                    metrics |= found
+                    warnings = tuple(collapse_warnings(found))
+                    self._log(found | {"alarms": float(len(warnings))})
+                if last or time.monotonic() - self._saved > options.checkpoint_every_s:
+                    self._save()
+                on_progress(TrainingProgress(self.step, settings.steps, dict(metrics), warnings))
         trained: KeypointNetwork = self.average
         return trained
 
@@ -154,35 +151,36 @@ class TrainingRun:
 
     def _resume(self) -> None:
         path = self.folder / CHECKPOINT_FILE
-        if not path.exists():
+        content = read_state(path, CHECKPOINT_FORMAT)
+        if content is None:
             return
-        checkpoint = read_checkpoint(path)
-        fixed = self.settings.model_dump(mode="json") | {"steps": checkpoint.settings.get("steps")}
-        if checkpoint.settings != fixed or checkpoint.stage != self.stage:
+        fixed = self.settings.model_dump(mode="json") | {"steps": content.get("settings", {}).get("steps")}
+        if "network" not in content or content["settings"] != fixed:
             raise InputError(f"{path}: belongs to a run with other settings; give the same or another --output")
-        if checkpoint.examples != self._examples:
+        if content["examples"] != self._examples:
             raise InputError(
                 f"{path}: was trained on other images, by another teacher or from another start; give another --output"
             )
-        if checkpoint.step > self.settings.steps:
+        if content["step"] > self.settings.steps:
             raise InputError(
-                f"{path}: has {checkpoint.step} steps already, more than {self.settings.steps}; give another --output"
+                f"{path}: has {content['step']} steps already, more than {self.settings.steps}; give another --output"
             )
-        try:
-            self.network.load_state_dict(checkpoint.part(NETWORK))
-            self.average.load_state_dict(checkpoint.part(AVERAGE))
-            restore_optimizer_state(self.optimizer, checkpoint.part(OPTIMIZER))
-        except (KeyError, RuntimeError, ValueError) as error:
-            raise InputError(f"{path}: does not fit this network ({error})") from error
-        self.step = checkpoint.step
+        self.network.load_state_dict(_tensors(content["network"]))
+        self.average.load_state_dict(_tensors(content["average"]))
+        restore_optimizer_state(self.optimizer, _tensors(content["optimizer"]))
+        self.step = content["step"]
 
     def _save(self) -> None:
-        tensors = {f"{NETWORK}{name}": value for name, value in self.network.state_dict().items()}
-        tensors |= {f"{AVERAGE}{name}": value for name, value in self.average.state_dict().items()}
-        tensors |= {f"{OPTIMIZER}{name}": value for name, value in get_optimizer_state(self.optimizer).items()}
-        settings = self.settings.model_dump(mode="json")
-        checkpoint = Checkpoint(self.stage, self.step, settings, tensors, self._examples)
-        write_checkpoint(self.folder / CHECKPOINT_FILE, checkpoint)
+        content = {
+            "step": self.step,
+            "settings": self.settings.model_dump(mode="json"),
+            "examples": self._examples,
+            "network": _arrays(self.network.state_dict()),
+            "average": _arrays(self.average.state_dict()),
+            "optimizer": _arrays(get_optimizer_state(self.optimizer)),
+        }
+        with writing(self.folder / CHECKPOINT_FILE):
+            write_state(self.folder / CHECKPOINT_FILE, CHECKPOINT_FORMAT, content)
         self._saved = time.monotonic()
 
     def _log(self, metrics: Mapping[str, float]) -> None:
@@ -190,18 +188,25 @@ class TrainingRun:
         with writing(path), path.open("a", newline="", encoding="utf-8") as file:
             rows = csv.writer(file)
             if not file.tell():
-                rows.writerow(("stage", "step", "name", "value"))
-            rows.writerows((self.stage, self.step, name, f"{value:.6g}") for name, value in metrics.items())
+                rows.writerow(("step", "name", "value"))
+            rows.writerows((self.step, name, f"{value:.6g}") for name, value in metrics.items())
 
 
-def read_curves(path: Path, stage: str) -> dict[str, Curve]:
-    """Curves of a stage from its log; of a step that was repeated, the later values count."""
+def read_curves(path: Path) -> dict[str, Curve]:
+    """Curves from the log of a run; of a step that was repeated, the later values count."""
     values: dict[str, dict[int, float]] = {}
     try:
         with path.open(newline="", encoding="utf-8") as file:
             for row in csv.DictReader(file):
-                if row["stage"] == stage:
-                    values.setdefault(row["name"], {})[int(row["step"])] = float(row["value"])
+                values.setdefault(row["name"], {})[int(row["step"])] = float(row["value"])
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path}: is not a log of a training run ({error})") from error
     return {name: (sorted(points), [points[step] for step in sorted(points)]) for name, points in values.items()}
+
+
+def _arrays(tensors: Mapping[str, Tensor]) -> State:
+    return {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
+
+
+def _tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fcslam.learning.federated.client import ClientUpdate
+from fcslam.learning.federated.client import InProcessFleet
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks, RoundRules
-from fcslam.learning.federated.fleets import InProcessFleet
+from fcslam.learning.federated.evaluation import PUBLIC_IMAGES, SCORE_METRICS
+from fcslam.learning.federated.messages import PAIRS
 from fcslam.learning.federated.screening import ScreeningBounds
 from fcslam.learning.federated.settings import FederatedSettings
 
@@ -34,21 +35,20 @@ def shifted(weights, by):
 
 @dataclass
 class Fake:
-    """Adds ``by`` to all weights; ``answer`` replaces that."""
+    """Adds ``by`` to all weights; ``answer`` replaces that. ``judge`` gives its report on pairs."""
 
     name: str
     by: float = 0.1
     answer: object = None
-    figures: dict = field(default_factory=lambda: {"repeatability": 0.5, "mma_3px": 0.5})
+    judge: object = None
     asked: list = field(default_factory=list)
 
-    def train(self, request):
+    def __call__(self, request):
+        if not request.is_training:
+            return {PAIRS: self.judge(request.weights)}, {}
         self.asked.append(request.round_number)
         new = self.answer(request.weights, request.round_number) if self.answer else shifted(request.weights, self.by)
-        return ClientUpdate(new, {"detector": self.by})
-
-    def evaluate(self, _request):
-        return self.figures
+        return new, {"detector": self.by}
 
 
 def settings(**given):
@@ -59,15 +59,16 @@ def rules(**given):
     return replace(PLAIN, **given)
 
 
-def run(robots, folder, chosen=None, fleet=None, start=START, rules=PLAIN, **given):
+def fleet_of(robots):
+    return InProcessFleet({robot.name: robot for robot in robots})
+
+
+def run(robots, folder, chosen=None, fleet=None, start=START, rules=PLAIN, score=lambda _weights: 0.5, **given):
+    """``score``: of weights, by public images."""
     reports = []
-    hooks = CoordinatorHooks(
-        **{
-            "version": version,
-            "evaluate_fn": lambda _weights: {"repeatability": 0.5, "mma_3px": 0.5},
-            "on_round": reports.append,
-        }
-        | given
-    )
-    fleet = fleet or InProcessFleet(robots)
-    return Coordinator(fleet, chosen or settings(), start, folder, hooks, rules).run(), reports
+
+    def evaluate(weights):
+        return {PUBLIC_IMAGES: dict.fromkeys(SCORE_METRICS, score(weights))}
+
+    hooks = CoordinatorHooks(version, evaluate, reports.append, **given)
+    return Coordinator(fleet or fleet_of(robots), chosen or settings(), start, folder, hooks, rules).run(), reports

@@ -12,15 +12,13 @@ from tests.learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 
 from fcslam.errors import InputError  # noqa: E402
-from fcslam.learning.arrays import write_arrays  # noqa: E402
 from fcslam.learning.code_batches import RevisitExamples, RevisitPair  # noqa: E402
-from fcslam.learning.federated.client import RobotClient, robot_seed  # noqa: E402
+from fcslam.learning.federated.client import STATE_FILE, ImageClient, RevisitClient, robot_seed  # noqa: E402
 from fcslam.learning.federated.messages import TrainingRequest  # noqa: E402
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network, weights_version  # noqa: E402
 from fcslam.learning.federated.settings import FederatedSettings  # noqa: E402
-from fcslam.learning.local_training import layer_names, network_from_state  # noqa: E402
-from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from fcslam.untrusted import read_arrays  # noqa: E402
+from fcslam.learning.network import KeypointNetwork, layer_names, network_from_state  # noqa: E402
+from fcslam.storage.state_file import read_state, write_state  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -45,19 +43,16 @@ def folder(tmp_path_factory):
     return made
 
 
-class Rover(RobotClient):
-    """Trains as a request asks."""
-
-    def learn(self, weights, number=0, run="run", chosen=None, lesson="images"):
-        return self.train(TrainingRequest(True, weights, "v", number, run, lesson, chosen or settings())).weights
+def learn(client, weights, number=0, run="run", chosen=None):
+    return client(TrainingRequest(True, weights, "v", number, run, chosen or settings()))[0]
 
 
 def robot(folder, cache, name="rover", **given):
-    return Rover(name, folder, cache, **given)
+    return ImageClient(name, cache, folder=folder, **given)
 
 
 def labels_in(cache):
-    return [file for file in cache.rglob("*.npz") if not file.stem.startswith("moments")]
+    return [file for file in cache.rglob("*.state") if file.name != STATE_FILE]
 
 
 def same(first, second):
@@ -65,13 +60,13 @@ def same(first, second):
 
 
 def test_a_round_depends_on_its_arguments_alone(folder, start, tmp_path):
-    whole = robot(folder, tmp_path / "labels").learn(start)
+    whole = learn(robot(folder, tmp_path / "labels"), start)
     kept = {name: array.copy() for name, array in start.items()}
-    again = robot(folder, tmp_path / "labels").learn(start)
+    again = learn(robot(folder, tmp_path / "labels"), start)
     assert same(whole, again)
     assert same(kept, start)
-    other = robot(folder, tmp_path / "labels", "other").learn(start)
-    later = robot(folder, tmp_path / "labels").learn(start, 1)
+    other = learn(robot(folder, tmp_path / "labels", "other"), start)
+    later = learn(robot(folder, tmp_path / "labels"), start, 1)
     assert not same(whole, other)
     assert not same(whole, later)
     assert whole.keys() == start.keys()
@@ -80,59 +75,57 @@ def test_a_round_depends_on_its_arguments_alone(folder, start, tmp_path):
 
 def test_labels_stay_those_of_the_first_weights(folder, start, tmp_path):
     first = robot(folder, tmp_path)
-    first.learn(start)
+    learn(first, start)
     labels = {file: file.read_bytes() for file in labels_in(tmp_path)}
     assert len(labels) == 3
     moved = {name: array * np.float32(1.1) for name, array in start.items()}
-    assert same(first.learn(moved, 1), robot(folder, tmp_path).learn(moved, 1))
+    assert same(learn(first, moved, 1), learn(robot(folder, tmp_path), moved, 1))
     assert {file: file.read_bytes() for file in labels_in(tmp_path)} == labels
 
 
 def test_a_robot_labels_no_more_images_than_asked(folder, start, tmp_path):
-    robot(folder, tmp_path, most_images=2).learn(start)
+    learn(robot(folder, tmp_path, most_images=2), start)
     assert len(labels_in(tmp_path)) == 2
 
 
 def test_the_optimizer_goes_on_from_the_robots_last_round(folder, start, tmp_path):
     def train(cache, round_number, run="run"):
-        return robot(folder, tmp_path / cache).learn(start, round_number, run, settings(rounds=9))
+        return learn(robot(folder, tmp_path / cache), start, round_number, run, settings(rounds=9))
 
     def kept(cache):
-        return {int(file.stem.split("-")[-1]) for file in (tmp_path / cache).glob("moments-*.npz")}
+        return set(read_state(tmp_path / cache / STATE_FILE, "run")["moments"])
 
     train("a", 0)
     fresh, second = train("b", 3), train("a", 3)
     assert not same(second, fresh), "it has learnt of gradients in round 0"
     assert same(train("a", 3), second), "asked again, it begins where it began before"
-    assert same(train("a", 3, "another run"), fresh)
     shutil.copytree(tmp_path / "a", tmp_path / "c")
+    shutil.copytree(tmp_path / "a", tmp_path / "d")
+    assert same(train("d", 3, "another run"), fresh)
     train("a", 4)
     assert not same(train("a", 5), train("c", 5))
-    assert kept("a") == {3, 4, 5}  # 3 is the other run's
+    assert kept("a") == {"4", "5"}
     train("a", 0)
     assert same(train("a", 3), second), "a run that begins anew does not know what came later"
 
 
 def test_what_cannot_be_kept_or_gone_on_with_is_told(folder, start, tmp_path):
-    robot(folder, tmp_path).learn(start, 0)
-    (moments,) = tmp_path.glob("moments-*.npz")
-    whole = read_arrays(moments)
-    of_another = {"0/exp_avg_sq": np.zeros(3, np.float32)}
+    fresh = learn(robot(folder, tmp_path), start, 1)
+    (tmp_path / STATE_FILE).unlink()
+    learn(robot(folder, tmp_path), start, 0)
+    state = read_state(tmp_path / STATE_FILE, "run")
+    whole = state["moments"]["0"]
     halved = {name: array for name, array in whole.items() if name != "0/exp_avg_sq"}
-    for odd in (whole | of_another, halved, {"0/exp_avg": whole["0/exp_avg"]}, {"nonsense": np.zeros(1)}):
-        write_arrays(moments, odd)
+    for odd in (whole | {"0/exp_avg_sq": np.zeros(3, np.float32)}, halved, {"nonsense": np.zeros(1)}):
+        write_state(tmp_path / STATE_FILE, "run", {"moments": {"0": odd}})
         with pytest.raises(InputError, match="cannot continue"):
-            robot(folder, tmp_path).learn(start, 1)
-    write_arrays(moments, {"0/step": np.array("text")})
-    with pytest.raises(InputError, match="cannot be read"):
-        robot(folder, tmp_path).learn(start, 1)
-    moments.write_bytes(b"broken")
-    with pytest.raises(InputError, match=rf"{moments.name}: the optimizer's state cannot be read"):
-        robot(folder, tmp_path).learn(start, 1)
-    moments.unlink()
-    moments.mkdir()
-    with pytest.raises(InputError, match=rf"{moments.name}: the optimizer's state cannot be kept"):
-        robot(folder, tmp_path).learn(start, 0)
+            learn(robot(folder, tmp_path), start, 1)
+    (tmp_path / STATE_FILE).write_bytes(b"broken")
+    assert same(learn(robot(folder, tmp_path), start, 1), fresh), "it begins anew"
+    (tmp_path / STATE_FILE).unlink()
+    (tmp_path / STATE_FILE).mkdir()
+    with pytest.raises(InputError, match=STATE_FILE):
+        learn(robot(folder, tmp_path), start, 0)
 
 
 def test_robots_and_seeds_draw_differently():
@@ -149,13 +142,13 @@ def test_too_few_images_are_said(content, start, tmp_path):
         for index in range(5):
             (images / f"{index}.png").write_bytes(b"no image")
     with pytest.raises(InputError, match=r"images: holds no image|only . of . image files can be trained on"):
-        robot(images, tmp_path / "labels").learn(start, 0)
+        learn(robot(images, tmp_path / "labels"), start, 0)
 
 
 def test_weights_of_another_network_are_refused(folder, start, tmp_path):
     chosen = settings(training={"encoder": "vgg"} | TINY["training"])
     with pytest.raises(InputError, match="no weights of a vgg network"):
-        robot(folder, tmp_path).learn(start, chosen=chosen)
+        learn(robot(folder, tmp_path), start, chosen=chosen)
     with pytest.raises(InputError, match="not those of a light network"):
         network_from_state("light", {})
 
@@ -179,7 +172,7 @@ def seen_again():
 
 def test_codes_are_trained_on_revisits_and_need_no_image_files(start, tmp_path, seen_again):
     def update(name, revisits):
-        return robot(tmp_path, tmp_path / name, name, revisits=revisits).learn(start, lesson="revisits")
+        return learn(RevisitClient(name, tmp_path / name, revisits=revisits), start)
 
     found = update("a", seen_again)
     changed = {name for name, array in found.items() if not np.array_equal(array, start[name])}
@@ -193,25 +186,14 @@ def test_codes_are_trained_on_revisits_and_need_no_image_files(start, tmp_path, 
 
 
 def test_codes_are_kept_to_those_of_the_run_s_first_weights(start, tmp_path, seen_again):
-    def learner(cache):
-        return robot(tmp_path, tmp_path / cache, revisits=seen_again)
-
-    def learn(client, weights, number, run="run"):
-        return client.learn(weights, number, run, settings(rounds=9), "revisits")
+    def trained(cache, weights, number, run="run"):
+        client = RevisitClient("rover", tmp_path / cache, revisits=seen_again)
+        return learn(client, weights, number, run, settings(rounds=9))
 
     torch.manual_seed(4)
     moved = network_to_weights(KeypointNetwork("light"))
-    first = learner("a")
-    learn(first, start, 0)
-    later = learn(first, moved, 1)
-    restarted = learner("a")
-    assert same(learn(restarted, moved, 1), later)
-    assert not same(learn(restarted, moved, 1, "another run"), later), "began before it was asked"
-    assert same(learn(restarted, moved, 1), later), "goes on as it was"
-    (former,) = {file for file in (tmp_path / "a").glob("former-*.npz") if same(read_arrays(file), start)}
-    former.unlink()
-    assert not same(learn(restarted, moved, 1), later)
-    former.unlink()
-    former.mkdir()
-    with pytest.raises(InputError, match=rf"{former.name}: the weights of the first round cannot be kept"):
-        learn(restarted, start, 0)
+    trained("a", start, 0)
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    later = trained("a", moved, 1)
+    assert same(trained("a", moved, 1), later), "started again, it goes on as it was"
+    assert not same(trained("b", moved, 1, "another run"), later), "began before it was asked"

@@ -12,10 +12,11 @@ from evaluation.federated.poison import PoisonedClient
 
 from fcslam.errors import InputError
 from fcslam.learning.federated.aggregation import average
-from fcslam.learning.federated.checkpoint import CHECKPOINT_FILE, read_state
-from fcslam.learning.federated.fleets import InProcessFleet
-from fcslam.learning.federated.history import ROUNDS_FILE
+from fcslam.learning.federated.checkpoint import read_checkpoint
+from fcslam.learning.federated.client import InProcessFleet
+from fcslam.learning.federated.rounds import ROUNDS_FILE
 from fcslam.learning.federated.screening import ScreeningBounds
+from fcslam.learning.trainer import CHECKPOINT_FILE
 from tests.learning.federated.fakes import START, Fake, rules, run, settings, shifted, version
 
 pytestmark = pytest.mark.slow
@@ -99,11 +100,11 @@ def test_what_is_judged_and_released_is_a_mean_of_rounds(tmp_path):
 
     def judge(weights):
         judged.append(float(weights["b.weight"]))
-        return {"repeatability": 0.5, "mma_3px": 0.5}
+        return 0.5
 
     chosen = settings(rounds=10, local_steps=100)
     fleet = [Fake("a", 0.1), Fake("b", 0.1)]
-    state, reports = run(fleet, tmp_path, chosen, evaluate_fn=judge, rules=rules(smoothing=0.8))
+    state, reports = run(fleet, tmp_path, chosen, score=judge, rules=rules(smoothing=0.8))
     weight, mean, expected = 0.5, 0.5, [0.5]
     for number in range(1, 11):
         weight += 0.1
@@ -132,12 +133,12 @@ def test_a_killed_server_ends_as_if_it_had_not_been(moment, tmp_path):
         if len(judged := judgements) == 3 and moment == "after a round":
             raise KeyboardInterrupt
         judged.append(weights)
-        return {"repeatability": 0.5, "mma_3px": 0.5}
+        return 0.5
 
     judgements = []
     second = Fake("b", answer=killed if moment == "in training" else ragged(2))
     with pytest.raises(KeyboardInterrupt):
-        run([Fake("a", answer=ragged(1)), second], tmp_path / "torn", chosen, rules=own, evaluate_fn=watch)
+        run([Fake("a", answer=ragged(1)), second], tmp_path / "torn", chosen, rules=own, score=watch)
     fleet = [Fake("a", answer=ragged(1)), Fake("b", answer=ragged(2))]
     resumed, late = run(fleet, tmp_path / "torn", chosen, rules=own)
     assert same(whole.weights, resumed.weights)
@@ -201,7 +202,7 @@ def test_stragglers_are_left_out_and_asked_again(tmp_path):
         return shifted(weights, 1.0)
 
     robots = [Fake("fast", 0.0), Fake("slow", answer=slowly)]
-    fleet = InProcessFleet(robots, lambda: now[0])
+    fleet = InProcessFleet({robot.name: robot for robot in robots}, lambda: now[0])
     state, reports = run(robots, tmp_path, settings(deadline_s=10.0), fleet)
     assert reports[0].left_out == {"slow": "no answer: gone, or later than the deadline"}
     assert reports[1].robots == ("fast", "slow")
@@ -240,12 +241,7 @@ def test_without_anybody_the_server_says_so_or_waits(tmp_path):
 def test_a_worse_detector_is_not_released_and_a_collapsed_one_is_undone(tmp_path):
     scores = iter([0.5, 0.6, 0.55, 0.2, 0.6])
     robots = [Fake("a", answer=ragged(1))]
-    state, reports = run(
-        robots,
-        tmp_path,
-        settings(rounds=4),
-        evaluate_fn=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores)),
-    )
+    state, reports = run(robots, tmp_path, settings(rounds=4), score=lambda _: next(scores))
     assert [report.released for report in reports] == [True, False, False, True]
     assert [report.returned for report in reports] == [False, False, True, False]
     first = ragged(1)(START, 0)
@@ -259,9 +255,9 @@ def test_after_a_collapse_the_mean_begins_anew_as_well(tmp_path):
 
     def judge(weights):
         judged.append(weights)
-        return dict.fromkeys(("repeatability", "mma_3px"), next(scores))
+        return next(scores)
 
-    state, reports = run([Fake("a", 1.0)], tmp_path, settings(rounds=3), evaluate_fn=judge, rules=rules(smoothing=0.8))
+    state, reports = run([Fake("a", 1.0)], tmp_path, settings(rounds=3), score=judge, rules=rules(smoothing=0.8))
     assert [report.returned for report in reports] == [False, True, True]
     assert same(state.weights, judged[1])
     assert same(state.average, judged[1])
@@ -287,9 +283,7 @@ def test_what_does_not_change_stays_to_the_last_bit_in_the_mean(tmp_path):
 
 def test_a_start_that_beats_what_follows_is_no_place_to_go_back_to(tmp_path):
     scores = iter([0.9, 0.1, 0.3])
-    state, reports = run(
-        [Fake("a", 0.5)], tmp_path, evaluate_fn=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores))
-    )
+    state, reports = run([Fake("a", 0.5)], tmp_path, score=lambda _: next(scores))
     assert [report.returned for report in reports] == [False, False]
     assert same(state.weights, shifted(START, 1.0))
 
@@ -312,7 +306,7 @@ def test_a_poisoned_robot_of_five_changes_nothing(poison, tmp_path):
 
     chosen, own = settings(rounds=3), rules(bounds=ScreeningBounds(least_agreement=0.01))
     alone, _ = run(fleet(), tmp_path / "alone", chosen, start=start, rules=own)
-    bad = PoisonedClient(Fake("bad", answer=towards(9)), poison)
+    bad = PoisonedClient(Fake("bad", answer=towards(9)), poison, "bad")
     together, reports = run([*fleet(), bad], tmp_path / "together", chosen, start=start, rules=own)
     assert all(set(report.left_out) == {"bad"} for report in reports)
     assert same(alone.weights, together.weights)
@@ -325,7 +319,7 @@ def test_robots_that_were_asked_before_a_kill_are_counted(tmp_path):
     for _ in range(3):
         with pytest.raises(KeyboardInterrupt):
             run([Fake("a"), Fake("b", answer=kills)], tmp_path)
-    state = read_state(tmp_path / CHECKPOINT_FILE, settings(), START, version(START))
+    state = read_checkpoint(tmp_path, settings(), START, version(START))
     assert (state.rounds_done, state.times_asked) == (0, {"a": 3, "b": 3})
     _, reports = run([Fake("a"), Fake("b")], tmp_path)
     size = reports[0].bytes_up
@@ -334,9 +328,7 @@ def test_robots_that_were_asked_before_a_kill_are_counted(tmp_path):
 
 def test_a_start_that_nothing_beats_stays(tmp_path):
     scores = iter([0.5, 0.4, 0.3])
-    state, reports = run(
-        [Fake("a")], tmp_path, evaluate_fn=lambda _w: dict.fromkeys(("repeatability", "mma_3px"), next(scores))
-    )
+    state, reports = run([Fake("a")], tmp_path, score=lambda _: next(scores))
     assert (state.best_round, [report.released for report in reports]) == (0, [False, False])
     assert same(state.best, START)
 
@@ -356,5 +348,5 @@ def test_a_checkpoint_of_another_run_is_refused_but_more_rounds_are_not(tmp_path
 def test_a_broken_checkpoint_is_told_as_such(tmp_path):
     run([Fake("a")], tmp_path)
     (tmp_path / CHECKPOINT_FILE).write_bytes(b"nonsense")
-    with pytest.raises(InputError, match="is not a checkpoint"):
+    with pytest.raises(InputError, match="is damaged"):
         run([Fake("a")], tmp_path)

@@ -15,10 +15,9 @@ from fcslam.learning.federated.fleet_grid import MAX_ROBOTS, ONLINE_S, FleetGrid
 from fcslam.learning.federated.fleet_server import PATH, FleetApp
 from fcslam.learning.federated.messages import TrainingReply, TrainingRequest, write_reply
 from fcslam.learning.federated.settings import FederatedSettings
-from fcslam.service.http.authentication import Authenticator
 
 WEIGHTS = {"a": np.ones(3, np.float32)}
-REQUEST = TrainingRequest(True, WEIGHTS, "light-1", 0, "run", "images", FederatedSettings())
+REQUEST = TrainingRequest(True, WEIGHTS, "light-1", 0, "run", FederatedSettings())
 
 
 class Clock:
@@ -44,8 +43,6 @@ def grid(clock):
 def asked(grid, *robots):
     """Replies to a request, complete after the block."""
     replies = {}
-    for robot in robots:
-        grid.mark_online(robot)
     waiting = threading.Thread(target=lambda: replies.update(grid.ask(robots, REQUEST, 30.0)))
     waiting.start()
     end = time.monotonic() + 30.0
@@ -107,36 +104,25 @@ def test_a_reply_beyond_the_limit_is_read_no_further(grid):
                 yield part
 
         async def reply():
-            app = FleetApp(grid, Authenticator(None), lambda _: None).asgi()
+            app = FleetApp(grid).asgi()
             async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost") as client:
                 return await client.post(PATH.format(robot="one") + f"/reply/{found.number}", content=endless())
 
         answer = asyncio.run(reply())
-    assert (answer.status_code, answer.text) == (413, f"one: a reply of more than {limit} bytes")
+    assert (answer.status_code, answer.text) == (413, f"a reply of more than {limit} bytes")
     assert read <= limit + len(part)
     assert replies["one"].error == f"a reply of more than {limit} bytes"
 
 
 def test_a_robot_is_online_for_a_while(grid, clock):
-    assert grid.robots() == []
+    assert grid.robots() == ["one", "two"]
+    clock.now = ONLINE_S
     assert grid.admits("two")
-    assert grid.robots() == []
-    grid.mark_online("two")
-    assert grid.robots() == ["two"]
     clock.now = ONLINE_S + 0.1
-    assert grid.robots() == []
-
-
-def test_nobody_waits_for_a_robot_that_is_gone(grid, clock):
-    """Nor keeps its request."""
-    grid.mark_online("one")
-    clock.now = ONLINE_S + 1.0
-    assert grid.ask(["one"], REQUEST) == {}
-    assert grid.next_request("one") is None
+    assert grid.robots() == ["two"]
 
 
 def test_a_request_is_withdrawn_at_the_deadline(grid):
-    grid.mark_online("one")
     assert grid.ask(["one"], REQUEST, 0.0) == {}
     assert grid.next_request("one") is None
 

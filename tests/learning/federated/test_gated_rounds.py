@@ -1,7 +1,5 @@
 """Rounds behind the release gate: only a version that passes is released."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
@@ -14,59 +12,52 @@ from tests.learning.federated.fakes import START, Fake, rules, run, settings, ve
 TRAINED = {name: array for name, array in START.items() if name != "a.running_var"}
 
 
-@dataclass
-class Judge(Fake):
-    """Finds the more, the larger the first weight is, times ``likes``."""
+def judge(name, likes=1.0, pairs=100):
+    """A robot that finds the more, the larger the first weight is, times ``likes``."""
 
-    likes: float = 1.0
-    pairs: int = 100
-
-    def judge(self, request):
+    def report(weights):
         rng = np.random.default_rng(1)
-        recall = (
-            0.3 + 0.1 * self.likes * (float(request.weights["a.weight"][0, 0]) - 1.0) + 0.01 * rng.random(self.pairs)
-        )
-        return np.column_stack((recall, rng.random(self.pairs) < 0.8)).astype(np.float32)
+        recall = 0.3 + 0.1 * likes * (float(weights["a.weight"][0, 0]) - 1.0) + 0.01 * rng.random(pairs)
+        return np.column_stack((recall, rng.random(pairs) < 0.8)).astype(np.float32)
+
+    return Fake(name, judge=report)
 
 
 def gated(robots, folder, rounds=2, **hooks):
-    given = {"evaluate_fn": None, "rules": rules(fewest_pairs=200), **hooks}
+    given = {"rules": rules(fewest_pairs=200), **hooks}
     return run(robots, folder, settings(rounds=rounds), start=TRAINED, **given)
 
 
 def test_a_version_that_passes_is_released(tmp_path):
-    state, reports = gated([Judge(f"r{k}") for k in range(3)], tmp_path)
+    state, reports = gated([judge(f"r{k}") for k in range(3)], tmp_path)
     assert [report.released for report in reports] == [True, True]
     assert state.best_round == 2
-    assert reports[0].metrics["pairs"] == 300.0
-    assert reports[0].metrics["revisit_recall_gain"] == pytest.approx(0.01, abs=1e-4)
+    assert reports[0].evaluation.metrics["pairs"] == 300.0
+    assert reports[0].evaluation.metrics["revisit_recall_gain"] == pytest.approx(0.01, abs=1e-4)
     assert reports[0].row()["reason"] == "better on held-out pairs"
 
 
 def test_a_version_that_is_worse_is_not_released(tmp_path):
-    state, reports = gated([Judge(f"r{k}", likes=-1.0) for k in range(3)], tmp_path)
+    state, reports = gated([judge(f"r{k}", likes=-1.0) for k in range(3)], tmp_path)
     assert not any(report.released for report in reports)
     assert state.best_round == 0
-    assert "not better on held-out pairs" in reports[0].reason
+    assert "not better on held-out pairs" in reports[0].evaluation.reason
 
 
 def test_a_small_fleet_with_few_pairs_releases_nothing(tmp_path):
-    _, reports = gated([Judge(f"r{k}", pairs=66) for k in range(3)], tmp_path)
-    assert [report.reason for report in reports] == ["198 held-out pairs, 200 needed"] * 2
+    _, reports = gated([judge(f"r{k}", pairs=66) for k in range(3)], tmp_path)
+    assert [report.evaluation.reason for report in reports] == ["198 held-out pairs, 200 needed"] * 2
 
 
 def test_a_robot_whose_report_is_no_report_does_not_count(tmp_path):
-    class Liar(Judge):
-        def judge(self, *_):
-            return np.full((500, 2), 7.0, np.float32)
-
-    _, reports = gated([Judge("r0"), Judge("r1"), Liar("r2")], tmp_path)
-    assert reports[0].metrics["pairs"] == 200.0
+    liar = Fake("r2", judge=lambda _weights: np.full((500, 2), 7.0, np.float32))
+    _, reports = gated([judge("r0"), judge("r1"), liar], tmp_path)
+    assert reports[0].evaluation.metrics["pairs"] == 200.0
     assert "numbers that no pair can have" in reports[0].left_out["judging by r2"]
 
 
 def test_a_release_survives_a_kill_between_the_checkpoint_and_its_announcement(tmp_path):
-    fleet, released = [Judge(f"r{k}") for k in range(3)], []
+    fleet, released = [judge(f"r{k}") for k in range(3)], []
 
     def killed(_weights):
         raise KeyboardInterrupt

@@ -8,17 +8,14 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 
+from fcslam.errors import InputError  # noqa: E402
 from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
+from fcslam.learning.federated.client import RevisitClient  # noqa: E402
 from fcslam.learning.federated.held_out import judge  # noqa: E402
 from fcslam.learning.federated.initial_weights import read_detector_weights  # noqa: E402
 from fcslam.learning.federated.networks import weights_to_network  # noqa: E402
 from fcslam.learning.federated.own_examples import SPLIT_FILE, own_examples  # noqa: E402
-from fcslam.learning.federated.robot_learning import (  # noqa: E402
-    BusyRobotError,
-    LearningEndError,
-    LearningRobot,
-)
-from fcslam.learning.federated.settings import RobotLearningSettings  # noqa: E402
+from fcslam.learning.federated.robot_learning import LearningRobot  # noqa: E402
 from fcslam.records import Channel, Place  # noqa: E402
 from fcslam.robot.backend import RobotBackend  # noqa: E402
 from fcslam.robot.backend_runner import inline  # noqa: E402
@@ -109,15 +106,18 @@ def test_a_full_disk_ends_keyframes_and_not_the_map(driven, tmp_path, monkeypatc
     assert read_keyframes(tmp_path / "keyframes", 10) == []
 
 
-class Client:
-    name = "alice"
-
-
-def test_a_robot_learns_only_while_it_is_idle_and_its_budget_lasts(tmp_path):
-    idle = threading.Event()
-    robot = LearningRobot(tmp_path, Client(), RobotLearningSettings(cpu_s=time.process_time() + 1e3), idle)
-    with pytest.raises(BusyRobotError):
-        robot.prepare()
-    spent = LearningRobot(tmp_path, Client(), RobotLearningSettings(cpu_s=1e-3), idle)
-    with pytest.raises(LearningEndError, match="CPU time"):
+def test_a_robot_learns_only_while_it_is_idle_and_its_budget_lasts(driven, tmp_path):
+    idle, told = threading.Event(), []
+    client = RevisitClient("alice", tmp_path)
+    robot = LearningRobot(driven[0], client, time.process_time() + 1e3, idle, told.append)
+    working = threading.Thread(target=robot.prepare, daemon=True)
+    working.start()
+    working.join(0.3)
+    assert working.is_alive()
+    idle.set()
+    working.join(60.0)
+    assert client.revisits
+    assert len(told) == 1
+    spent = LearningRobot(driven[0], client, 1e-3, idle, told.append)
+    with pytest.raises(InputError, match="CPU time"):
         spent.prepare()

@@ -10,6 +10,7 @@ from fastapi import FastAPI
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
 from fcslam.learning.federated.relay import learning_router
+from tests.service.http.desk import Desk
 
 
 @pytest.fixture
@@ -27,7 +28,7 @@ def asked(tmp_path):
 
 
 def test_while_no_process_learns_a_robot_is_to_try_again(asked):
-    assert {asked(operation) for operation in ("next", "alive", "reply/7")} == {503}
+    assert {asked(operation) for operation in ("next", "reply/7")} == {503}
 
 
 @pytest.mark.attack
@@ -37,3 +38,12 @@ def test_while_no_process_learns_a_robot_is_to_try_again(asked):
 def test_the_path_of_a_robot_leads_to_no_other(asked, operation):
     """The service has checked the token of anna; the process behind it believes the path."""
     assert asked(operation) in (404, 422)
+
+
+@pytest.mark.attack
+def test_a_robot_learns_in_its_own_name_only(tmp_path):
+    with Desk(tmp_path) as desk:
+        desk.app.include_router(learning_router(desk.state, tmp_path / "nobody"))
+        paths = [f"/api/v1/robots/a/learning/{operation}" for operation in ("next", "reply/7")]
+        for who, status in ((None, 401), ("b", 403), ("eye", 403), ("a", 503)):
+            assert {desk.ask("POST", path, who).status_code for path in paths} == {status}

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import inf
 from typing import Final
 
@@ -21,23 +21,13 @@ MAX_ROBOTS: Final = 1000
 
 @dataclass(frozen=True, slots=True)
 class PendingRequest:
-    """A request that waits for a robot's reply."""
+    """A request that waits for the replies of robots."""
 
     number: int
     data: bytes
     """The serialised request."""
 
 
-@dataclass(slots=True)
-class FleetMember:
-    """A robot, its request and its reply."""
-
-    seen_s: float = -inf
-    request: PendingRequest | None = None
-    reply: TrainingReply | None = None
-
-
-@dataclass(slots=True)
 class FleetGrid:
     """Requests and replies of the robots of a fleet. Any thread may call.
 
@@ -45,31 +35,30 @@ class FleetGrid:
     again gets it again, and only the first reply counts.
     """
 
-    clock: Callable[[], float] = time.monotonic
-    _members: dict[str, FleetMember] = field(default_factory=dict)
-    _issued: int = 0
-    _changed: threading.Condition = field(default_factory=threading.Condition)
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._seen_s: dict[str, float] = {}
+        self._request = PendingRequest(0, b"")
+        self._awaited: set[str] = set()
+        self._replies: dict[str, TrainingReply] = {}
+        self._changed = threading.Condition()
 
     def admits(self, robot: str) -> bool:
-        """Whether the fleet has room for a robot."""
+        """Whether the fleet has room for a robot, which is now there: rounds wait for it."""
         with self._changed:
-            if robot not in self._members and len(self._members) < MAX_ROBOTS:
-                self._members[robot] = FleetMember()
-            return robot in self._members
-
-    def mark_online(self, robot: str) -> None:
-        """Note that an admitted robot asks for requests or works on one: rounds wait for it."""
-        with self._changed:
-            self._members[robot].seen_s = self.clock()
+            if robot not in self._seen_s and len(self._seen_s) >= MAX_ROBOTS:
+                return False
+            self._seen_s[robot] = self._clock()
+            return True
 
     def next_request(self, robot: str) -> PendingRequest | None:
         """The request that the robot should work on now; None if no request waits."""
-        self.mark_online(robot)
-        return self._members[robot].request
+        with self._changed:
+            return self._request if robot in self._awaited else None
 
     def reply_limit(self, robot: str, number: int) -> int:
         """Largest size of the reply to a request [bytes]; 0 if the robot has no such request."""
-        request = self._members[robot].request
+        request = self.next_request(robot)
         if request is None or request.number != number:
             return 0
         return int(MAX_REPLY_RATIO * len(request.data)) + REPLY_OVERHEAD_BYTES
@@ -89,33 +78,26 @@ class FleetGrid:
     def robots(self) -> list[str]:
         """Names of the robots that were heard of a short time ago, sorted."""
         with self._changed:
-            now = self.clock()
-            return sorted(robot for robot, member in self._members.items() if now - member.seen_s <= ONLINE_S)
+            now = self._clock()
+            return sorted(robot for robot, seen_s in self._seen_s.items() if now - seen_s <= ONLINE_S)
 
     def ask(
         self, robots: Collection[str], request: TrainingRequest, deadline_s: float = inf
     ) -> dict[str, TrainingReply]:
-        """Replies that arrive within the deadline. Nobody waits for a robot that is gone."""
-        data, end = write_request(request), self.clock() + deadline_s
+        """Replies that arrive within the deadline."""
+        data = write_request(request)
         with self._changed:
-            asked = {robot: self._members[robot] for robot in robots}
-            for member in asked.values():
-                self._issued += 1
-                member.request, member.reply = PendingRequest(self._issued, data), None
-            while self._is_awaited(asked) and self.clock() < end:
-                self._changed.wait(1.0)  # wakes up to see whether a robot has gone
-            for member in asked.values():
-                member.request = None
-            return {robot: member.reply for robot, member in asked.items() if member.reply is not None}
+            self._request = PendingRequest(self._request.number + 1, data)
+            self._awaited, self._replies = set(robots), {}
+            self._changed.wait_for(lambda: not self._awaited, min(deadline_s, threading.TIMEOUT_MAX))
+            self._awaited = set()
+            return self._replies
 
     def _close(self, robot: str, number: int, reply: TrainingReply) -> bool:
         with self._changed:
-            member = self._members[robot]
-            if member.request is None or member.request.number != number:
+            if robot not in self._awaited or self._request.number != number:
                 return False
-            member.request, member.reply = None, reply
+            self._awaited.discard(robot)
+            self._replies[robot] = reply
             self._changed.notify_all()
             return True
-
-    def _is_awaited(self, asked: Collection[str]) -> bool:
-        return any(self._members[robot].request is not None for robot in self.robots() if robot in asked)

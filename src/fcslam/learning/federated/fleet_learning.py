@@ -10,6 +10,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -19,64 +20,60 @@ import torch
 from fcslam.errors import FcslamError, writing
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.learning.federated.coordinator import RoundRules
-from fcslam.learning.federated.fleet_server import open_port, waiting
-from fcslam.learning.federated.history import RoundReport
-from fcslam.learning.federated.job import FederatedJob, ProgressCallbacks, run_job
+from fcslam.learning.federated.fleet_grid import FleetGrid
+from fcslam.learning.federated.fleet_server import listening
+from fcslam.learning.federated.job import FederatedJob, run_job
+from fcslam.learning.federated.rounds import RoundReport
 from fcslam.learning.federated.settings import RELEASE, FleetLearningSettings
-from fcslam.learning.trainer import ExecutionOptions
 from fcslam.processes import emit_event
-from fcslam.service.http.authentication import Authenticator
 from fcslam.service.supervisor import READY
 from fcslam.storage.files import write_file
 
 NICENESS: Final = 10
 START: Final = "start.onnx"
 """The detector from which training started, in the output folder."""
+WAIT_S: Final = 5.0
+"""Time after which a round is tried again that could not be completed."""
 _log = logging.getLogger("fcslam.learning")
 
 
 def run(data: Path, output: Path, settings: FleetLearningSettings, listener: socket.socket) -> None:
     """Learn until all rounds are done, and live on."""
-
-    def report(done: RoundReport) -> None:
-        decision = f"{done.version} is released" if done.released else "not released"
-        if done.reason:
-            _log.info("round %d: %s: %s", done.round_number, decision, done.reason)
-
     told: set[str] = set()
 
-    def say_once(line: str) -> None:
-        if line not in told:
-            told.add(line)
-            _log.info("%s", line)
+    def report(done: RoundReport) -> None:
+        if done.evaluation.reason:
+            decision = f"{done.version} is released" if done.released else "not released"
+            _log.info("round %d: %s: %s", done.round_number, decision, done.evaluation.reason)
 
-    rules = RoundRules(fewest_pairs=settings.fewest_pairs)
-    job = FederatedJob(output, settings.federated, _start(data, output), rules=rules)
-    options = ExecutionOptions(device="cpu", threads=1)
-    everybody = Authenticator(None)  # the service has asked for the token
-    with open_port(listener, None, everybody, say_once) as grid:
+    def wait(reason: str) -> None:
+        if reason not in told:
+            told.add(reason)
+            _log.info("waiting: %s", reason)
+        time.sleep(WAIT_S)
+
+    job = FederatedJob(
+        output, settings.federated, _start(data, output), rules=RoundRules(fewest_pairs=settings.fewest_pairs)
+    )
+    grid = FleetGrid()
+    with listening(grid, listener):
         emit_event(READY, None)
-        progress = ProgressCallbacks(rounds=report, released=lambda _weights: emit_event(RELEASE, None))
-        run_job(job, options, progress, grid, waiting(say_once))
+        run_job(job, grid, on_round=report, on_release=lambda _weights: emit_event(RELEASE, None), wait=wait)
         _log.info("all %d rounds are done", settings.federated.rounds)
         threading.Event().wait()
 
 
 def _start(data: Path, output: Path) -> Path:
-    """The detector from which training starts: a copy of the one that was announced at the first start."""
-    kept = output / START
+    """The detector from which training starts: a copy of the one that the service announced at the first start, or of
+    the bundled one."""
+    kept, folder = output / START, data / "detectors" / "camera"
+    named = folder / "announced"
     with writing(kept, "free disk space"):
         if not kept.exists():
             output.mkdir(parents=True, exist_ok=True)
-            write_file(kept, _announced(data).read_bytes())
+            file = folder / f"{named.read_text(encoding='utf-8')}.onnx" if named.is_file() else BUNDLED_NETWORK
+            write_file(kept, file.read_bytes())
     return kept
-
-
-def _announced(data: Path) -> Path:
-    """The file of the detector that the service announces, or the bundled one."""
-    folder = data / "detectors" / "camera"
-    named = folder / "announced"
-    return folder / f"{named.read_text(encoding='utf-8')}.onnx" if named.is_file() else BUNDLED_NETWORK
 
 
 def _end_with_stdin() -> None:

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +16,13 @@ from fcslam.errors import InputError, printable
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, size_bytes
 
-Lesson = Literal["images", "revisits"]
-"""What robots train on: their images, all layers; or points that they saw again, the layers of the codes alone, with
-batch statistics as they are."""
-
 PAIRS: Final = "pairs"
 """Name of the array in which a robot reports on the pairs that it holds out."""
 MAX_NAME_LENGTH: Final = 64
 MAX_FIGURES: Final = 32
 """A reply with more figures than this is refused: fcslam's clients send fewer than ten."""
 LARGEST_FIGURE: Final = 1e6
-"""Losses and metrics are of the order of 1. A larger one, or one that is not a number, would spoil a mean."""
+"""Losses are of the order of 1. A larger one, or one that is not a number, would spoil a mean."""
 MAX_REASON_LENGTH: Final = 300
 """Longer texts from a robot are cut, so that one robot cannot flood the table of rounds."""
 _LENGTH_BYTES: Final = 4
@@ -34,7 +30,7 @@ _LENGTH_BYTES: Final = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingRequest:
-    """A request to train from weights, or to evaluate them."""
+    """A request to train from weights, or to report on held-out pairs with them."""
 
     is_training: bool
     weights: Weights
@@ -44,7 +40,6 @@ class TrainingRequest:
     """From 0."""
     run_id: str
     """Identifies the run to clients that keep state over its rounds."""
-    lesson: Lesson
     settings: FederatedSettings
 
 
@@ -57,7 +52,7 @@ class TrainingReply:
     """Of the weights in the request."""
     arrays: Weights = field(default_factory=dict)
     figures: Mapping[str, float] = field(default_factory=dict)
-    """Losses, or metrics of an evaluation."""
+    """Losses."""
     error: str = ""
     """Why there is nothing else."""
 
@@ -69,7 +64,6 @@ def write_request(request: TrainingRequest) -> bytes:
         "version": request.version,
         "round": request.round_number,
         "run": request.run_id,
-        "lesson": request.lesson,
         "settings": request.settings.model_dump(mode="json"),
     }
     return _pack(header, request.weights)
@@ -84,17 +78,8 @@ def read_request(data: bytes) -> TrainingRequest:
     try:
         header, weights = _unpack(data)
         settings = FederatedSettings.model_validate(header["settings"])
-        if header["lesson"] not in ("images", "revisits"):
-            raise ValueError(f"it has the unknown lesson {header['lesson']}")
-        return TrainingRequest(
-            bool(header["is_training"]),
-            weights,
-            str(header["version"]),
-            int(header["round"]),
-            str(header["run"]),
-            header["lesson"],
-            settings,
-        )
+        names = str(header["version"]), int(header["round"]), str(header["run"])
+        return TrainingRequest(bool(header["is_training"]), weights, *names, settings)
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise InputError(
             f"the server's request cannot be read ({error}); install the same version of fcslam on both machines"
@@ -128,7 +113,6 @@ def _pack(header: Mapping[str, Any], arrays: Weights) -> bytes:
 
 
 def _unpack(data: bytes) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
-    """The inverse of ``_pack``; ValueError, or an error of a type that JSON lacks, if there is none."""
     begin = _LENGTH_BYTES + int.from_bytes(data[:_LENGTH_BYTES], "little")
     try:
         header = json.loads(data[_LENGTH_BYTES:begin])
@@ -148,19 +132,6 @@ def _unpack(data: bytes) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]
     return header, arrays
 
 
-def check_figures(figures: Mapping[str, float]) -> None:
-    """Check losses or metrics of a robot.
-
-    Raises:
-        ValueError: there are too many, some have names that are not identifiers, or are not plausible numbers.
-    """
-    if len(figures) > MAX_FIGURES or not all(name.isidentifier() and len(name) <= MAX_NAME_LENGTH for name in figures):
-        raise ValueError("figures that the server did not request")
-    odd = next((name for name, value in figures.items() if not abs(value) <= LARGEST_FIGURE), None)
-    if odd is not None:
-        raise ValueError(f"{odd} is {figures[odd]:g}")
-
-
 def checked_reply(reply: TrainingReply, robot: str, version: str) -> TrainingReply:
     """The reply, if it is one of this robot about this version.
 
@@ -171,7 +142,12 @@ def checked_reply(reply: TrainingReply, robot: str, version: str) -> TrainingRep
         raise ValueError(reply.error)
     if (reply.robot, reply.version) != (robot, version):
         raise ValueError(f"an answer by {reply.robot} about version {reply.version}, not by {robot} about {version}")
-    check_figures(reply.figures)
+    figures = reply.figures
+    if len(figures) > MAX_FIGURES or not all(name.isidentifier() and len(name) <= MAX_NAME_LENGTH for name in figures):
+        raise ValueError("figures that the server did not request")
+    for name, value in figures.items():
+        if not abs(value) <= LARGEST_FIGURE:
+            raise ValueError(f"{name} is {value:g}")
     return reply
 
 
@@ -190,11 +166,6 @@ class RoundReplies:
         self.left_out[robot] = printable_line(reason)
         for kept in (self.weights, self.losses):
             kept.pop(robot, None)
-
-    def add_notes(self, notes: Mapping[str, str]) -> None:
-        """Report other problems of the round beside the robots that are left out, by what they concern."""
-        for subject, reason in notes.items():
-            self.left_out.setdefault(subject, printable_line(reason))
 
 
 def printable_line(text: str) -> str:

@@ -1,10 +1,4 @@
-"""The only place that converts between networks and weights.
-
-    KeypointNetwork  <->  Weights (float32 arrays by name)  <->  ArrayRecord
-
-Aggregation and screening work on ``Weights``. Networks exist where something is trained or evaluated, records
-(``messages``) where something is sent.
-"""
+"""Converts between networks and weights, float32 arrays by name, on which aggregation and screening work."""
 
 import numpy as np
 import torch
@@ -13,8 +7,7 @@ from numpy.typing import NDArray
 from fcslam.errors import InputError
 from fcslam.learning.export import detector_version
 from fcslam.learning.federated.weights import Weights, weights_error
-from fcslam.learning.local_training import network_from_state
-from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.network import KeypointNetwork, network_from_state
 from fcslam.learning.settings import Encoder
 
 

@@ -13,7 +13,7 @@ from fcslam.service.http.robots import Name
 from fcslam.service.http.state import ServiceState
 
 ANSWER_S: Final = 60.0
-Operation = Annotated[str, InPath(pattern="^(next|alive|reply/[0-9]{1,18})$")]
+Operation = Annotated[str, InPath(pattern="^(next|reply/[0-9]{1,18})$")]
 """Nothing else may stand in the path: it would lead to the operations of another robot."""
 
 

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
+from contextlib import closing
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +20,7 @@ import torch
 
 from fcslam.errors import FcslamError, InputError
 from fcslam.learning.code_training import CodeInputs
-from fcslam.learning.federated.client import RobotClient
+from fcslam.learning.federated.client import RevisitClient
 from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
 from fcslam.learning.federated.learning_process import NOTICE
 from fcslam.learning.federated.own_examples import own_examples
@@ -33,89 +33,47 @@ FRESH_S: Final = 20.0
 """Time for which the examples are not looked for again."""
 
 
-class BusyRobotError(Exception):
-    """The robot drives again; learning goes on when it is idle."""
-
-
-class LearningEndError(Exception):
-    """Learning has come to its end; the text says why."""
-
-
 class LearningRobot:
-    """Joins rounds with a client while the robot is idle and its budget lasts."""
+    """Lets a client work while the robot is idle and its budget lasts, on examples from its newest keyframes."""
 
     def __init__(
-        self, folder: Path, client: RobotClient, settings: RobotLearningSettings, idle: threading.Event
+        self,
+        folder: Path,
+        client: RevisitClient,
+        cpu_s: float,
+        idle: threading.Event,
+        notice: Callable[[str], None],
     ) -> None:
-        """``folder``: of the keyframes; from which ``client`` gets examples; ``idle``: set while the robot is idle."""
-        self._folder, self._client, self._settings, self._idle = folder, client, settings, idle
+        """``folder``: of the keyframes; ``cpu_s``: the budget; ``idle``: set while the robot is idle."""
+        self._folder, self._client, self._cpu_s, self._idle, self._notice = folder, client, cpu_s, idle, notice
         self._looked_s = float("-inf")
-        self._seen: int | None = None
+        self._seen = 0
 
-    def pause(self, _robot: str, _steps: int) -> None:
-        """Between two steps: wait while the robot is busy.
+    def pause(self, _robot: str = "", _steps: int = 0) -> None:
+        """Before each step: wait while the robot is busy.
 
         Raises:
             InputError: the budget is spent.
         """
-        if time.process_time() > self._settings.cpu_s:
-            raise InputError(f"{self._client.name} has spent its CPU time for learning")
+        if time.process_time() > self._cpu_s:
+            raise InputError(f"the CPU time for learning is spent ({self._cpu_s:.0f} s)")
         self._idle.wait()
 
     def prepare(self) -> bool:
-        """Before each request: look for new examples; returns whether there are any.
-
-        Raises:
-            BusyRobotError: the robot is busy.
-            LearningEndError: the budget is spent.
-        """
-        if time.process_time() > self._settings.cpu_s:
-            raise LearningEndError(f"the CPU time for learning is spent ({self._settings.cpu_s:.0f} s)")
-        if not self._idle.is_set():
-            raise BusyRobotError
-        now = time.monotonic()
-        if now - self._looked_s > FRESH_S:
+        """Before each request: look for new examples; returns whether there are any. Raises as ``pause``."""
+        self.pause()
+        if time.monotonic() - self._looked_s > FRESH_S:
             written = max((path.stat().st_mtime_ns for path in self._folder.glob("*.state")), default=0)
             if written != self._seen:
-                self._look()
                 self._seen = written
+                revisits, held_out = own_examples(self._folder)
+                self._client.revisits, self._client.held_out, self._client.inputs = revisits, held_out, CodeInputs()
+                self._notice(
+                    f"learns from {len(revisits.images)} images: {len(revisits.pairs)} pairs of its own; "
+                    f"{len(held_out.revisits)} pairs held out"
+                )
             self._looked_s = time.monotonic()
         return bool(self._client.revisits)
-
-    def _look(self) -> None:
-        revisits, held_out = own_examples(self._folder)
-        self._client.revisits, self._client.held_out, self._client.inputs = revisits, held_out, CodeInputs()
-        emit_event(
-            NOTICE,
-            f"learns from {len(revisits.images)} images: {len(revisits.pairs)} pairs of its own; "
-            f"{len(held_out.revisits)} pairs held out",
-        )
-
-
-def learn(open_link: Callable[[], RobotLink], client: RobotClient, robot: LearningRobot, idle: threading.Event) -> str:
-    """Join rounds until learning ends; returns why.
-
-    Raises:
-        InputError: the server does not accept the robot.
-        CloudError: the server's address or certificate cannot be used.
-    """
-    told = ""
-
-    def notice(line: str) -> None:
-        nonlocal told
-        if line != told:
-            told = line
-            emit_event(NOTICE, line)
-
-    while True:
-        idle.wait()
-        try:
-            with open_link() as link:
-                serve_requests(link, client, notice, is_ready=robot.prepare)
-        except BusyRobotError:
-            continue
-        except LearningEndError as end:
-            return str(end)
 
 
 def _listen(idle: threading.Event) -> None:
@@ -142,17 +100,24 @@ def main(arguments: Sequence[str]) -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     os.nice(NICENESS)
     torch.set_num_threads(1)
-    idle = threading.Event()
+    idle, told = threading.Event(), ""
     threading.Thread(target=_listen, args=(idle,), daemon=True).start()
+
+    def notice(line: str) -> None:
+        nonlocal told
+        if line != told:
+            told = line
+            emit_event(NOTICE, line)
+
     try:
         shown = Credentials() if given.credentials is None else read_credentials(given.credentials)
-        client = RobotClient(given.name, given.keyframes, given.cache)
-        robot = LearningRobot(given.keyframes, client, given.settings, idle)
+        client = RevisitClient(given.name, given.cache)
+        robot = LearningRobot(given.keyframes, client, given.settings.cpu_s, idle, notice)
         client.on_step = robot.pause
-        link = partial(RobotLink, given.server, given.name, shown)
-        emit_event(NOTICE, f"learning ends: {learn(link, client, robot, idle)}")
+        with closing(RobotLink(given.server, given.name, shown)) as link:
+            serve_requests(link, client, notice, is_ready=robot.prepare)
     except (FcslamError, OSError) as error:
-        emit_event(NOTICE, f"learning ends: {error}")
+        notice(f"learning ends: {error}")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""The table of rounds, rounds.csv. It is rewritten as a whole after each round."""
+"""Federated rounds in reports: the outcome of each round, and the table of them."""
 
 import csv
 import io
@@ -8,19 +8,36 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from fcslam.errors import InputError, writing
+from fcslam.errors import writing
 from fcslam.storage.files import write_file
 
 ROUNDS_FILE: Final = "rounds.csv"
 LOSS: Final = "loss_"
 """Prefix of the columns of losses."""
+Row = Mapping[str, str]
 
-Row = dict[str, str]
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """A version beside the released one; without arguments: it was not evaluated."""
+
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    """Medians over the evaluators, or means over held-out pairs with their gains."""
+    score: float = math.nan
+    """By which versions are compared, in [0, 1]."""
+    gain: float = math.nan
+    """Of the score over that of the released version."""
+    released: bool = False
+    """Whether it is the new detector."""
+    reason: str = ""
+    """The gate's reason for releasing it or not; empty without a gate."""
+    scores: Mapping[str, float] = field(default_factory=dict)
+    """By evaluator."""
 
 
 @dataclass(frozen=True, slots=True)
 class RoundReport:
-    """The outcome of a round. The columns of the table have the same names."""
+    """The outcome of a round."""
 
     round_number: int
     """From 1."""
@@ -32,51 +49,38 @@ class RoundReport:
     """Reasons by robot why other updates were not, and other problems of the round by what they concern."""
     losses: Mapping[str, float] = field(default_factory=dict)
     """Means over robots and steps."""
-    metrics: Mapping[str, float] = field(default_factory=dict)
-    """Metrics of the evaluation; empty if the round was not evaluated."""
-    score: float = math.nan
-    """By which versions are compared, in [0, 1]; NaN if there was no evaluation."""
-    released: bool = False
-    """The version is the best so far and becomes the new detector."""
+    evaluation: Evaluation = Evaluation()
     returned: bool = False
     """The version was so bad that training returned to the best one."""
-    reason: str = ""
-    """The gate's reason for releasing the version or not; empty without a gate."""
     bytes_down: int = 0
     """Size of the weights that were sent to all robots."""
     bytes_up: int = 0
     """Size of the weights that all robots sent."""
-    seconds: float = 0.0
+    seconds: float = math.nan
     """Duration of the round."""
+
+    @property
+    def released(self) -> bool:
+        """The version is the best so far and becomes the new detector."""
+        return self.evaluation.released
 
     def row(self) -> Row:
         """The cells of the table by column."""
         return {
             "round": str(self.round_number),
             "version": self.version,
-            "score": f"{self.score:.6g}",
+            "score": f"{self.evaluation.score:.6g}",
             "released": str(int(self.released)),
             "returned": str(int(self.returned)),
-            "reason": self.reason,
+            "reason": self.evaluation.reason,
             "bytes_down": str(self.bytes_down),
             "bytes_up": str(self.bytes_up),
             "seconds": f"{self.seconds:.3f}",
             "robots": " | ".join(self.robots),
             "left_out": " | ".join(f"{robot}: {reason}" for robot, reason in sorted(self.left_out.items())),
             **{f"{LOSS}{name}": f"{value:.6g}" for name, value in self.losses.items()},
-            **{name: f"{value:.6g}" for name, value in self.metrics.items()},
+            **{name: f"{value:.6g}" for name, value in self.evaluation.metrics.items()},
         }
-
-
-def read_rows(path: Path, last: int) -> list[Row]:
-    """Rows up to round ``last``; none if there is no file."""
-    if not path.exists():
-        return []
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            return [row for row in csv.DictReader(file) if int(row["round"]) <= last]
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise InputError(f"{path}: is not a table of rounds ({error}); remove it") from error
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:

@@ -1,6 +1,6 @@
-"""One step of training: forward pass, losses, backward pass, update."""
+"""The training loop: at each step losses, gradients and an update of the weights, with a schedule of the rate."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor
 from fcslam.errors import InputError
 from fcslam.learning.batches import TrainingBatch
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.objective import LossWeights, TeacherBits, grid_shift, objective
+from fcslam.learning.objective import LOSSES, TeacherBits, grid_shift, objective
 from fcslam.learning.settings import TrainingSettings
 
 CLIP_NORM: Final = 1.0
@@ -21,6 +21,9 @@ LAST_RATE: Final = 1e-5
 """Learning rate at the end of training, and the lowest one."""
 DECAY_SHARE: Final = 0.3
 """Share of the steps, at the end, over which the learning rate falls."""
+
+LossesOf = Callable[[int], tuple[Tensor, dict[str, Tensor]]]
+"""Gives the loss to descend at a step of the whole run, and its parts by name."""
 
 
 def reduced_precision(device: torch.device) -> torch.autocast:
@@ -38,7 +41,7 @@ def create_optimizer(network: KeypointNetwork) -> torch.optim.Optimizer:
 
 
 def get_optimizer_state(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """The optimizer's step counts and moments as tensors, by parameter number and name."""
+    """The optimizer's step counts and moments, by parameter number and name."""
     states = optimizer.state_dict()["state"]
     return {f"{index}/{name}": value for index, entries in states.items() for name, value in entries.items()}
 
@@ -67,7 +70,6 @@ def step_losses(
     batch: TrainingBatch,
     settings: TrainingSettings,
     step: int,
-    weights: LossWeights,
     bits: TeacherBits | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The sum to minimise at a step, and the losses in it by name.
@@ -77,19 +79,33 @@ def step_losses(
     with reduced_precision(batch.images.device):
         maps = network(batch.images.contiguous(memory_format=torch.channels_last))
     shift = grid_shift(settings.encoder, settings.seed, step)
-    return objective(maps, batch, weights, step / settings.steps, shift, bits)
+    return objective(maps, batch, LOSSES[settings.losses], step / settings.steps, shift, bits)
 
 
-def descend(network: KeypointNetwork, optimizer: torch.optim.Optimizer, total: Tensor, step: int, rate: float) -> None:
-    """Follow the gradient of a step's sum of losses in place, with this learning rate."""
-    if not torch.isfinite(total):
-        raise InputError(f"training diverged at step {step}; lower the learning rate")
-    for group in optimizer.param_groups:
-        group["lr"] = rate
-    optimizer.zero_grad(set_to_none=True)
-    total.backward()
-    torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)
-    optimizer.step()
+def descend(
+    network: KeypointNetwork,
+    optimizer: torch.optim.Optimizer,
+    losses_of: LossesOf,
+    settings: TrainingSettings,
+    steps: range,
+    ramp_steps: int = 0,
+) -> Iterator[tuple[int, dict[str, Tensor]]]:
+    """Follow the gradient of the losses in place; after each step, gives its number and its losses by name.
+
+    ``steps`` are numbers over the whole run. The learning rate rises over the first ``ramp_steps`` of them.
+    """
+    for step in steps:
+        total, losses = losses_of(step)
+        if not torch.isfinite(total):
+            raise InputError(f"training diverged at step {step}; lower the learning rate")
+        ramp = min((step + 1 - steps.start) / ramp_steps, 1.0) if ramp_steps else 1.0
+        for group in optimizer.param_groups:
+            group["lr"] = ramp * learning_rate(settings, step)
+        optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP_NORM)
+        optimizer.step()
+        yield step, losses
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
