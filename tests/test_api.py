@@ -16,7 +16,6 @@ import pytest
 
 import fcslam
 from fcslam import api, errors
-from fcslam.geometry import se2
 from fcslam.sources import open_source
 
 ROOT = Path(__file__).parents[1]
@@ -106,42 +105,6 @@ def test_names_load_their_modules_at_the_first_use():
         "assert 'fcslam.records' in after and 'fcslam.mission.mission' not in after\n"
     )
     subprocess.run([sys.executable, "-c", program], cwd=ROOT / "src", check=True)
-
-
-def test_a_run_that_was_opened_offers_what_was_mapped(mapped, opened, logs):
-    assert list(mapped.trajectories) == list(opened.trajectories) == [log.stem for log in logs]
-    for robot, own in mapped.trajectories.items():
-        read = opened.trajectories[robot]
-        assert (own.robot, own.map_index) == (read.robot, read.map_index) == (robot, read.map_index)
-        np.testing.assert_allclose(read.stamps, own.stamps, atol=1e-6, rtol=0)
-        np.testing.assert_allclose(se2.between(own.T_map_base, read.T_map_base), 0.0, atol=1e-7)
-        assert read.path_length_m == pytest.approx(own.path_length_m, abs=1e-4)
-    assert list(mapped.maps) == list(opened.maps) == sorted({t.map_index for t in mapped.trajectories.values()})
-    for k, drawn in mapped.maps.items():
-        assert np.array_equal(drawn.cells, opened.maps[k].cells)
-        assert (drawn.resolution_m, drawn.origin_xy) == (opened.maps[k].resolution_m, opened.maps[k].origin_xy)
-    assert mapped.closures
-    for own, read in zip(mapped.closures, opened.closures, strict=True):
-        for name in ("robot_i", "robot_j", "channel", "status"):
-            assert getattr(own, name) == getattr(read, name)
-        assert (own.reason.code, own.reason.setting) == (read.reason.code, read.reason.setting)
-        for written, found in ((own.reason.value, read.reason.value), (own.reason.limit, read.reason.limit)):
-            assert (found is None) == (written is None)
-            assert found is None or found == pytest.approx(written, rel=1e-5)
-        for name in ("stamp_i", "stamp_j", "similarity"):
-            assert getattr(own, name) == pytest.approx(getattr(read, name), abs=1e-6)
-        np.testing.assert_allclose(own.T_i_j, read.T_i_j, atol=1e-6)
-    assert {name: (m.name, m.unit) for name, m in mapped.metrics.items()} == {
-        name: (m.name, m.unit) for name, m in opened.metrics.items()
-    }
-    values = [[metric.value for metric in run.metrics.values()] for run in (mapped, opened)]
-    np.testing.assert_array_equal(*values)
-    for name in ("config_yaml", "pose_graph_g2o", "map_files"):
-        assert getattr(mapped, name) == getattr(opened, name)
-    for robot, own in mapped.local_maps.items():
-        read = opened.local_maps[robot]
-        assert np.array_equal(own.occupancy().cells, read.occupancy().cells)
-        np.testing.assert_allclose(se2.between(own.T_local_base, read.T_local_base), 0.0, atol=1e-7)
 
 
 def test_a_run_that_was_opened_can_be_saved_again(opened, tmp_path):
@@ -238,13 +201,6 @@ def test_what_is_wrong_is_an_input_error_of_one_line_before_the_work(arguments, 
 def test_a_start_that_no_map_has_is_refused_before_the_work(pose, said, logs, opened):
     with pytest.raises(fcslam.InputError, match=re.escape(said)) as raised:
         fcslam.localize(logs[0], opened.maps[0], initial_pose=pose, progress=lambda _: pytest.fail("worked"))
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize("place", ["nowhere", "."])
-def test_a_folder_that_holds_no_run_is_refused(place, tmp_path):
-    with pytest.raises(fcslam.InputError, match="not a run folder") as raised:
-        fcslam.open_run(tmp_path / place)
     assert "\n" not in str(raised.value)
 
 

@@ -211,38 +211,6 @@ def test_the_documented_example_writes_a_bag_that_can_be_read(tmp_path, monkeypa
     assert open_source(tmp_path / "robot1.mcap").survey().scan_count == 20
 
 
-@pytest.mark.parametrize(
-    ("line", "complete", "fine"),
-    [
-        ("fcslam map a.clf b.clf -o out", True, True),
-        ("fcslam localize", True, False),
-        ("fcslam map", False, True),
-        ("fcslam map --config", False, True),
-        ("fcslam map --pieces 3", False, False),
-        ("fcslam map a.clf -o out --split none", True, False),
-        ("fcslam tools config > mission.yaml", True, True),
-        ("fcslam config print", False, False),
-        ("fcslam fly", False, False),
-        ("fcslam --version", True, True),
-        ("fcslam --install-completion", False, True),
-        ("fcslam tools federate --local", False, False),
-    ],
-)
-def test_the_rule_for_commands(line, complete, fine):
-    assert (complaint(line, complete) == "") is fine
-
-
-def test_the_rules_for_files_symbols_and_settings():
-    page = ROOT / "docs" / "reference" / "page.md"
-    assert missing_files("see `lidar/field.py`, [wire](wire.md), `../../Makefile.toml`", page) == [
-        "../../Makefile.toml"
-    ]
-    assert missing_symbols("`similarity` in `places/similarity.py`") == []
-    assert missing_symbols("`sameness` in `places/similarity.py`") == ["sameness in places/similarity.py"]
-    assert is_setting("fleet.consistency.separation_m")
-    assert not is_setting("fleet.consistency.separation")
-
-
 MESSAGE = re.compile(r"^\| `([^`]+)` \|", re.MULTILINE)
 """A message in the first column of a table of docs/troubleshooting.md; dots stand for what differs."""
 BROKEN_TEXT = re.compile(r"\"\s*\n\s*f?\"")

@@ -46,11 +46,6 @@ def test_only_floors_keep_rooms_apart_that_look_alike(alike, floors, maps):
     assert bool(between) == (maps == 1)
 
 
-def test_the_name_of_the_floor_changes_no_pose(alike):
-    named, unnamed = (feed(Cloud(FleetConfig(), 0), on_floors(alike, (floor, floor))).finalize() for floor in ("7", ""))
-    assert fingerprint(named) == fingerprint(unnamed)
-
-
 def test_a_fleet_with_floors_goes_on_from_its_state(alike, tmp_path):
     packets = on_floors(alike, ("1", "2"))
     stored = {PacketNumber(packet.robot, packet.sequence): packet for packet in packets}

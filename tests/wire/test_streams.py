@@ -42,11 +42,6 @@ def test_ranges_come_back(expected):
     assert np.array_equal(unpack_ranges(packed, len(expected)), expected)
 
 
-def test_smooth_ranges_take_a_byte_each():
-    walls = np.random.default_rng(0).normal(0.0, 7.5, 360) + 2000.0 + 800.0 * np.sin(np.arange(360) / 30.0)
-    assert len(pack_ranges(walls.astype(np.uint16))) < 360
-
-
 @pytest.mark.parametrize("value", [0, 1, 65535])
 def test_the_longest_scan_of_one_range(value):
     expected = np.full(4096, value, np.uint16)
@@ -131,13 +126,3 @@ def test_a_stream_of_many_more_numbers_takes_no_memory(what):
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert most < 1_000_000
-
-
-def test_keypoints_out_of_order_are_refused():
-    with pytest.raises(PacketError, match="ascending"):
-        unpack_keypoints(pack_keypoints(np.array([[1, 0], [0, 0]], np.int16)), 2, 2)
-
-
-def test_the_smallest_16_bit_number_is_no_keypoint():
-    with pytest.raises(PacketError, match="beyond 32,767 steps"):
-        unpack_keypoints(pack_keypoints(np.array([[-32768, 0]], np.int16)), 1, 2)
