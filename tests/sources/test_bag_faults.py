@@ -144,15 +144,6 @@ def test_a_laser_with_a_second_parent_is_where_the_base_says(tmp_path, is_first)
     source = open_source(save(tmp_path / "run.bag", [stray, *drive(20)]))
     assert source.survey().scan_count == 20
     assert source.survey().lasers[0].T_base_laser == pytest.approx(LASER_POSE)
-    (note,) = source.survey().notes
-    first, second = ("camera", "base_link") if is_first else ("base_link", "camera")
-    assert f"'laser' is in '{first}' and in '{second}'; the pose below 'base_link' is used" in note
-
-
-def test_a_laser_with_two_poses_names_both_parents(tmp_path):
-    stray = [tf(101.0, "chassis", "laser"), tf(101.0, "base_link", "chassis")]
-    message = refusal(save(tmp_path / "run.bag", [*stray, *drive(20)]))
-    assert "tf has two transforms from 'base_link' to 'laser' ('laser' is in 'chassis' and in 'base_link'" in message
 
 
 def test_a_laser_that_moves_on_the_robot(tmp_path):

@@ -233,10 +233,6 @@ class RosBag:
             for its, mounted in zip(of_several, mountings, strict=True)
             if (tilt := tilt_note(mounted))
         )
-        placed = dict.fromkeys(() if self.has_given_pose else (tree.placed(each.first.frame) for each in lasers))
-        several_parents = (
-            f"{self.path}: {frames}; the pose below '{base_frame}' is used" for frames in placed if frames
-        )
         unlimited = (
             f"{self.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
             for laser, its_m in zip(lasers, farthest_m, strict=True)
@@ -256,7 +252,6 @@ class RosBag:
             *plan.topics.notes,
             *plan.odometry_notes,
             *tilts,
-            *several_parents,
             *camera_notes,
         )
         rig = rig_of([laser.first for laser in lasers], farthest_m, mountings, camera)

@@ -1,7 +1,7 @@
 """The tree of transforms (tf) of a bag, and the mounting of the laser in it."""
 
+from collections import deque
 from collections.abc import Iterator
-from contextlib import suppress
 from itertools import pairwise
 from math import acos, atan2, cos, isfinite, pi, sin, sqrt
 from typing import NamedTuple
@@ -98,47 +98,42 @@ class TransformTree:
         return frame in self._parents or any(parent == frame for parent, _ in self.links)
 
     def fixed(self, base: str, frame: str) -> Transform:
-        """``T_base_frame``; of a frame with several parents, that through those below ``base``.
+        """``T_base_frame`` along the shortest way.
 
         Raises:
-            NoTransformError: the frames are not connected, one moves against the other, or two parents disagree.
+            NoTransformError: the frames are not connected, or one moves against the other.
         """
-        parents = self._parents.get(frame, [])
-        if frame == base or len(parents) < 2:
-            return self._along(base, frame)
-        found: dict[str, Transform] = {}
-        for parent in [each for each in parents if base in self._above(each)] or parents:
-            T_parent_frame = self.links[parent, frame]
-            with suppress(NoTransformError):
-                if T_parent_frame is not None:
-                    found[parent] = _compose(self._along(base, parent), T_parent_frame)
-        if not found:
-            raise NoTransformError(f"no fixed transform from '{base}' to '{frame}' ({self.placed(frame)})")
-        (one, first), *others = found.items()
-        if other := next((parent for parent, T_base_frame in others if differ(first, T_base_frame)), None):
-            raise NoTransformError(
-                f"two transforms from '{base}' to '{frame}' ('{frame}' is in '{one}' and in '{other}'; stop one)"
-            )
-        return first
+        way = self._way(base, frame, is_fixed_only=True)
+        if way is None:
+            moving = self._way(base, frame, is_fixed_only=False)
+            if moving is None:
+                raise NoTransformError(f"no transform from '{base}' to '{frame}'")
+            pairs = (pair for at in pairwise(moving) for pair in (at, at[::-1]))
+            parent, child = next(pair for pair in pairs if self.links.get(pair, IDENTITY) is None)
+            raise NoTransformError(f"no fixed transform from '{base}' to '{frame}' ('{child}' moves in '{parent}')")
+        result = IDENTITY
+        for at, to in reversed(list(pairwise(way))):
+            step = self.links.get((at, to))
+            result = _compose(_inverse(self.links[to, at] or IDENTITY) if step is None else step, result)
+        return result
 
-    def _along(self, base: str, frame: str) -> Transform:
-        above_base, above_frame = list(self._above(base)), list(self._above(frame))
-        meeting = next((ancestor for ancestor in above_frame if ancestor in above_base), None)
-        if meeting is None:
-            raise NoTransformError(f"no transform from '{base}' to '{frame}'")
-        down = above_frame[: above_frame.index(meeting) + 1]
-        up = above_base[: above_base.index(meeting) + 1]
-        for child, parent in (*pairwise(up), *pairwise(down)):
-            if self.links[parent, child] is None or len(self._parents[child]) > 1:
-                why = f"'{child}' moves in '{parent}'" if self.links[parent, child] is None else self.placed(child)
-                raise NoTransformError(f"no fixed transform from '{base}' to '{frame}' ({why})")
-        return _compose(_inverse(self._chain(up)), self._chain(down))
-
-    def placed(self, frame: str) -> str:
-        """In which frames a frame is, as a sentence, if these are several; else empty."""
-        if len(self._parents.get(frame, ())) < 2:
-            return ""
-        return f"'{frame}' is in " + " and in ".join(f"'{parent}'" for parent in self._parents[frame][:2])
+    def _way(self, base: str, frame: str, is_fixed_only: bool) -> list[str] | None:
+        """The frames on the shortest way, with both ends."""
+        beside: dict[str, list[str]] = {}
+        for (parent, child), T_parent_child in self.links.items():
+            if T_parent_child is not None or not is_fixed_only:
+                beside.setdefault(parent, []).append(child)
+                beside.setdefault(child, []).append(parent)
+        seen, ways = {base}, deque([[base]])
+        while ways:
+            way = ways.popleft()
+            if way[-1] == frame:
+                return way
+            for near in beside.get(way[-1], ()):
+                if near not in seen:
+                    seen.add(near)
+                    ways.append([*way, near])
+        return None
 
     def robot(self, frame: str, odom_frame: str | None = None, base_frame: str | None = None) -> Link:
         """The transform in which the robot with ``frame`` moves: its parent and child.
@@ -180,14 +175,6 @@ class TransformTree:
             yield frame
             parents = self._parents.get(frame, [frame])
             frame = next((parent for parent in parents if parent in self._parents), parents[0])
-
-    def _chain(self, frames: list[str]) -> Transform:
-        result = IDENTITY
-        for child, parent in pairwise(frames):
-            T_parent_child = self.links[parent, child]
-            assert T_parent_child is not None
-            result = _compose(T_parent_child, result)
-        return result
 
 
 def last_part(name: str) -> str:
