@@ -176,7 +176,6 @@ def test_a_laser_that_falls_silent_does_not_hold_up_the_other(tmp_path):
             BagOptions(("/scan", "/rear"), laser_poses=((0.0, 0.0, 0.0),)),
             "1 laser-pose for 2 scan-topic of --sensors",
         ),
-        (front_and_rear(), BagOptions(("/scan", "/scan")), "--sensors scan-topic=/scan is given twice"),
     ],
 )
 def test_lasers_that_cannot_be_told_apart_are_refused_in_one_line(tmp_path, said, options, words):

@@ -8,13 +8,13 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import chain
+from itertools import chain, repeat
 from pathlib import Path
 from typing import NamedTuple
 
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
-from fcslam.records import CameraModel, GnssFix, Odometry, SensorRecord, frozen
+from fcslam.records import GnssFix, Odometry, SensorRecord, frozen
 from fcslam.sources.bags.census import DecodedBag
 from fcslam.sources.bags.codec import LASER_SCANS
 from fcslam.sources.bags.fixes import FIX_INTERVAL_S, fix_of, fix_topics
@@ -77,7 +77,11 @@ class RosBag:
         self._notes = notes
         self._options = options or BagOptions()
         """The options by which it is read."""
-        self._check_options()
+        topics, poses = self._options.scan_topics, self._options.laser_poses
+        if topics and 0 < len(poses) < len(topics):
+            raise SourceError(
+                f"{path}: {len(poses)} laser-pose for {len(topics)} scan-topic of --sensors; {_EACH_LASER}"
+            )
         self.bag = DecodedBag(path) if robot is None else robot.bag
         self._given_robot = robot
         self._audit = _audit()
@@ -214,8 +218,7 @@ class RosBag:
         self._refuse(audit.faults(), scans, odometry, errors)
         which = [f" of {laser.name}" for laser in lasers]
         for sample, its, recorded in zip(samples, which, lasers, strict=True):
-            is_scan = recorded.topic.type in LASER_SCANS
-            sample.check(self.path, its, _OF_SCANS if is_scan else _OF_CLOUDS)
+            sample.check(self.path, its, _OF_SCANS if recorded.topic.type in LASER_SCANS else _OF_CLOUDS)
         placeholders = tuple(sample.placeholders() for sample in samples)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
         mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(base_frame, errors)]
@@ -226,47 +229,36 @@ class RosBag:
             body_notes = [
                 f"{self.path}: points up to {radius_m:.2f} m from the base belong to the robot and are left out"
             ]
-        camera, camera_notes = self._camera(base_frame)
-        of_several = which if len(which) > 1 else [""]
-        tilts = (
-            f"{self.path}: the laser{its} is {tilt}"
-            for its, mounted in zip(of_several, mountings, strict=True)
-            if (tilt := tilt_note(mounted))
-        )
-        unlimited = (
-            f"{self.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
-            for laser, its_m in zip(lasers, farthest_m, strict=True)
-            if its_m == UNKNOWN_RANGE_M
-        )
-        notes = (
-            *self._notes,
+        camera, camera_note = None, ""
+        if plan.topics.camera is not None:
+            camera, camera_note = mounted_camera(plan.calibration, tree, base_frame)
+        notes = [
             *self.bag.notes,
-            *unlimited,
+            *(
+                f"{self.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
+                for laser, its_m in zip(lasers, farthest_m, strict=True)
+                if its_m == UNKNOWN_RANGE_M
+            ),
             *chain.from_iterable(laser.notes(self.path, self._options.cloud_band) for laser in lasers),
             *plan.scans.notes,
             *body_notes,
-            *chain.from_iterable(
-                placeholder_note(self.path, values, its) for values, its in zip(placeholders, which, strict=True)
-            ),
+            *chain.from_iterable(map(placeholder_note, repeat(self.path), placeholders, which)),
             *self.robot.notes,
             *plan.topics.notes,
             *plan.odometry_notes,
-            *tilts,
-            *camera_notes,
-        )
+            *(
+                f"{self.path}: the laser{its * (len(which) > 1)} is {tilt}"
+                for its, mounted in zip(which, mountings, strict=True)
+                if (tilt := tilt_note(mounted))
+            ),
+        ]
+        if plan.topics.camera is not None and camera_note:
+            notes.append(f"{self.path}: the camera of {plan.topics.camera.name} {camera_note}")
         rig = rig_of([laser.first for laser in lasers], farthest_m, mountings, camera)
-        survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, camera)
+        survey = Survey(
+            scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), (*self._notes, *notes), camera
+        )
         return _Reading(survey, rig, band, placeholders, base_frame)
-
-    def _check_options(self) -> None:
-        path, topics, poses = self.path, self._options.scan_topics, self._options.laser_poses
-        for topic in topics:
-            if topics.count(topic) > 1:
-                raise SourceError(f"{path}: --sensors scan-topic={topic} is given twice; give each laser's topic once")
-        if poses and topics and len(poses) < len(topics):
-            raise SourceError(
-                f"{path}: {len(poses)} laser-pose for {len(topics)} scan-topic of --sensors; {_EACH_LASER}"
-            )
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary, errors: Mapping[str, str]) -> None:
         path, topics, (laser, *_) = self.path, self.plan.topics, self.plan.lasers
@@ -334,13 +326,6 @@ class RosBag:
             options = replace(options, scan_topics=topics, laser_poses=poses)
         called = "_".join(filter(None, (name, robot.name.strip("/").replace("/", "_")))) or self.name
         return RosBag(self.path, called, options, self._notes, robot)
-
-    def _camera(self, base_frame: str) -> tuple[CameraModel | None, tuple[str, ...]]:
-        path, topic = self.path, self.plan.topics.camera
-        if topic is None:
-            return None, ()
-        camera, note = mounted_camera(self.plan.calibration, self.plan.tree, base_frame)
-        return camera, (f"{path}: the camera of {topic.name} {note}",) * bool(note)
 
 
 def _moved(mounted: Mounting, correction: BagCorrection) -> Mounting:

@@ -98,7 +98,7 @@ def choose_topics(
             remedy = f"the compressed depth images of {packed[0]} are not read; record {packed[0].rpartition('/')[0]}"
         what = f"no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images"
         raise SourceError(f"{known.label}{what}{known.place}; {remedy}; {_listed(known)}")
-    lasers = [_named(known, name, "--sensors scan-topic") for name in options.scan_topics]
+    lasers = [_named(known, name, "--sensors scan-topic") for name in dict.fromkeys(options.scan_topics)]
     if not lasers:
         lasers = [_best_scan(_preferred(scans), field_of_view_rad)]
     odometries = [*_measured(known), *known.transforms]
