@@ -213,8 +213,7 @@ def test_bad_ranges_become_nan_and_are_counted(tmp_path):
     np.testing.assert_array_equal(np.isnan(first), [False, True, True, True, True, False, False, False])
     assert np.isfinite(first[[0, 5, 6, 7]]).all()
     assert first[7] > 50.0
-    assert source.faults[Fault.NON_FINITE_RANGE] == FaultCount(6, 1)
-    assert source.faults[Fault.NEGATIVE_RANGE] == FaultCount(2, 1)
+    assert source.faults[Fault.INVALID_RANGE] == FaultCount(8, 1)
 
 
 def test_faults_belong_to_the_latest_pass(tmp_path):
@@ -225,7 +224,7 @@ def test_faults_belong_to_the_latest_pass(tmp_path):
         assert len(scans_of(source)) == 19
         assert source.faults[Fault.BROKEN_LINE].count == 1
     assert bool(source.faults)
-    assert source.faults[Fault.NEGATIVE_RANGE] == FaultCount()
+    assert source.faults[Fault.INVALID_RANGE] == FaultCount()
 
 
 def test_a_file_without_line_ends_does_not_fill_the_memory(tmp_path):

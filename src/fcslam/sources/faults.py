@@ -24,9 +24,8 @@ class Fault(StrEnum):
     TIME_REVERSAL = "steps back in time kept"
     NO_STAMP = "scans without a stamp taken as 1 s apart"
     REPEATED_STAMP = "scans with the stamp of the scan before"
-    NON_FINITE_RANGE = "ranges that are not finite made invalid"
+    INVALID_RANGE = "ranges that are negative or not finite made invalid"
     FIX_AT_ZERO = "GNSS fixes at latitude 0, longitude 0 skipped"
-    NEGATIVE_RANGE = "negative ranges made invalid"
     NO_RETURN = "scans without a return, which clear nothing"
 
 

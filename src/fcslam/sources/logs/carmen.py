@@ -20,15 +20,17 @@ from collections.abc import Callable
 from math import isfinite, nan
 from typing import NamedTuple
 
+import numpy as np
+
 from fcslam.geometry.beams import is_field_of_view
-from fcslam.records import Beams
+from fcslam.records import Beams, Ranges, frozen
 from fcslam.sources.pose import Pose
 
 SICK_MAX_RANGE_M = 50.0
 """SICK scanners send it, or more, for no return."""
 _MAX_COORDINATE = 1e7
 """Metres or radians; a larger pose is damage."""
-_NUMBER_LETTERS = b"0123456789.+-eEinfatyINFATY \t"
+_LONGEST_RANGE_M = 1e6
 
 _RAW, _SCAN = (
     re.compile(rb"^[ \t]*(" + name + rb")\s", re.MULTILINE) for name in (rb"RAWLASER1", rb"FLASER|ROBOTLASER1")
@@ -51,14 +53,14 @@ class StatedLaser(NamedTuple):
 
 
 class ScanLine(NamedTuple):
-    """One scan, its ranges as text."""
+    """One scan."""
 
     stamp: float
     """Seconds; NaN if the log states none."""
     T_odom_base: Pose
     T_odom_laser: Pose
-    beam_count: int
-    range_text: bytes
+    ranges_m: Ranges
+    """Those that are negative, not finite or too large are NaN."""
     stated: StatedLaser | None = None
     is_timed: bool = True
     """False once a stamp stands where the log states none."""
@@ -107,7 +109,7 @@ class CarmenParser:
         }
 
     def __call__(self, line: bytes) -> Line | None:
-        """The message of a line, its ranges as text; None if it is not used. Raises ValueError for a broken line."""
+        """The message of a line; None if it is not used. Raises ValueError for a broken line."""
         message = _MESSAGE.match(line)
         if message is None:
             raise ValueError("no CARMEN message")
@@ -131,15 +133,13 @@ class CarmenParser:
 
 def _parse_flaser(line: bytes) -> ScanLine:
     front, *tail = line.rsplit(None, 9)
-    _, count, range_text = front.split(None, 2)
-    beam_count = int(count)
-    is_timed = _has_beams(range_text, beam_count)
+    _, count, *words = front.split()
+    is_timed = len(words) == int(count)
     if not is_timed:
         front, *tail = line.rsplit(None, 6)
-        _, _, range_text = front.split(None, 2)
-    _check_beams(range_text, beam_count)
+        _, _, *words = front.split()
     stamp = _stamp_of(tail[6]) if is_timed else nan
-    return ScanLine(stamp, _pose_of(tail[3:6]), _pose_of(tail[:3]), beam_count, range_text)
+    return ScanLine(stamp, _pose_of(tail[3:6]), _pose_of(tail[:3]), _ranges_of(words, int(count)))
 
 
 def _parse_robotlaser(line: bytes) -> ScanLine:
@@ -148,22 +148,24 @@ def _parse_robotlaser(line: bytes) -> ScanLine:
     return ScanLine(_stamp_of(tail[11]), _pose_of(tail[3:6]), _pose_of(tail[:3]), *measured)
 
 
-def _measured(front: bytes) -> tuple[int, bytes, StatedLaser]:
-    _, kind, start, fov, resolution, max_range, _, _, count, body = front.split(None, 9)
+def _measured(front: bytes) -> tuple[Ranges, StatedLaser]:
+    """Ranges and laser in a line up to its remissions."""
+    _, kind, start, fov, resolution, max_range, _, _, count, *words = front.split()
     beam_count = int(count)
-    range_text = _without_remissions(body, beam_count)
-    _check_beams(range_text, beam_count)
-    numbers = [float(token) for token in (start, fov, resolution, max_range)]
-    return beam_count, range_text, _stated_laser(int(kind), numbers, beam_count)
-
-
-def _without_remissions(body: bytes, beam_count: int) -> bytes:
-    if body.endswith(b" 0") and body.count(b" ") == beam_count:
-        return body[:-2]
-    words = body.split()
     if not 0 < beam_count < len(words) or len(words) != beam_count + 1 + int(words[beam_count]):
         raise ValueError("not as many ranges and remissions as stated")
-    return b" ".join(words[:beam_count])
+    ranges_m = _ranges_of(words[:beam_count], beam_count)
+    numbers = [float(token) for token in (start, fov, resolution, max_range)]
+    return ranges_m, _stated_laser(int(kind), numbers, beam_count)
+
+
+def _ranges_of(words: list[bytes], beam_count: int) -> Ranges:
+    if beam_count < 2 or len(words) != beam_count:
+        raise ValueError("not as many ranges as stated")
+    values = np.array(words, dtype=np.float64)
+    if not (values.min() >= 0.0 and values.max() < _LONGEST_RANGE_M):
+        values = np.where((values >= 0.0) & np.isfinite(values), np.minimum(values, _LONGEST_RANGE_M), nan)
+    return frozen(values, np.float32)
 
 
 def _stated_laser(kind: int, numbers: list[float], beam_count: int) -> StatedLaser:
@@ -198,15 +200,3 @@ def _stamp_of(token: bytes) -> float:
     if not isfinite(stamp):
         raise ValueError("no finite stamp")
     return stamp
-
-
-def _check_beams(range_text: bytes, beam_count: int) -> None:
-    """Raise ValueError unless ``range_text`` has ``beam_count`` numbers, at least two, by count and characters."""
-    if beam_count < 2 or not _has_beams(range_text, beam_count):
-        raise ValueError("not as many ranges as stated")
-    if range_text.translate(None, _NUMBER_LETTERS):
-        raise ValueError("a range is not a number")
-
-
-def _has_beams(range_text: bytes, beam_count: int) -> bool:
-    return range_text.count(b" ") + 1 == beam_count or len(range_text.split()) == beam_count

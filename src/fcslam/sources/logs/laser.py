@@ -32,18 +32,18 @@ _RESOLUTION_DEG = {101: 1.0, 201: 0.5, 401: 0.25, 541: 0.5, 1081: 0.25}
 
 def usual_log_beams(scans: Sequence[ScanLine], parameters: Mapping[str, str]) -> Beams:
     """The usual beams of the first scans of a log."""
-    stated = [Beams(scan.beam_count, *scan.stated[:2]) for scan in scans if scan.stated is not None]
+    stated = [Beams(len(scan.ranges_m), *scan.stated[:2]) for scan in scans if scan.stated is not None]
     if stated:
         return usual_beams(stated)
-    (count, _), *_ = Counter(scan.beam_count for scan in scans).most_common(1)
+    (count, _), *_ = Counter(len(scan.ranges_m) for scan in scans).most_common(1)
     return Beams(count, *assumed_laser(count, parameters)[:2])
 
 
 def beams_of(scan: ScanLine, declared: Beams) -> Beams | None:
     """The beams that the line states, or those of the laser; None if there are more or fewer and no angles."""
     if scan.stated is not None:
-        return Beams(scan.beam_count, scan.stated.angle_min_rad, scan.stated.angle_increment_rad)
-    return declared if scan.beam_count == declared.beam_count else None
+        return Beams(len(scan.ranges_m), scan.stated.angle_min_rad, scan.stated.angle_increment_rad)
+    return declared if len(scan.ranges_m) == declared.beam_count else None
 
 
 class MountingEstimate:
@@ -79,8 +79,8 @@ class MountingEstimate:
 def laser_model(scan: ScanLine, parameters: Mapping[str, str], mounting: MountingEstimate) -> LaserModel:
     """The laser of ``scan``."""
     T_base_laser = mounting.T_base_laser(_parameter(parameters, "robot_frontlaser_offset") or 0.0)
-    stated = scan.stated or assumed_laser(scan.beam_count, parameters)
-    return LaserModel(scan.beam_count, *stated, T_base_laser)
+    stated = scan.stated or assumed_laser(len(scan.ranges_m), parameters)
+    return LaserModel(len(scan.ranges_m), *stated, T_base_laser)
 
 
 def assumed_laser(beam_count: int, parameters: Mapping[str, str] | None = None) -> StatedLaser:

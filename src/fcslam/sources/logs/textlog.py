@@ -9,9 +9,8 @@ Besides the rules of ``gate``:
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from functools import cached_property
-from math import isnan, nan
+from math import isnan
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +18,7 @@ import numpy as np
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
-from fcslam.records import Beams, FloatArray, LaserScan, Odometry, Ranges, SensorRecord, frozen
+from fcslam.records import Beams, FloatArray, LaserScan, Odometry, SensorRecord, frozen
 from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, check_consistency, scan_window
@@ -51,7 +50,6 @@ KEPT_BYTES = 1 << 25
 NumberedLine = tuple[int, Line | None]
 """A line with its number, counted from 1; None if it is broken."""
 _WORDS_NAMED, _LONGEST_WORD = 5, 20
-_LONGEST_RANGE_M = 1e6
 UNTIMED_STEP_S = 1.0
 """Time between the scans of a log that states none."""
 
@@ -109,17 +107,11 @@ class TextLog:
                 if self._reading.has_odometry:
                     yield Odometry(entry.stamp, T_odom_base)
                 continue
-            model = laser.with_beams(entry.beams)
-            ranges_m: Ranges | None
-            try:
-                ranges_m = _parse_ranges(entry.line, number, audit)
-            except ValueError:
-                ranges_m = None
-            if ranges_m is None or len(ranges_m) != model.beam_count:
-                audit.add(Fault.BROKEN_LINE, number)
-                continue
+            ranges_m = entry.line.ranges_m
+            if invalid := int(np.count_nonzero(np.isnan(ranges_m))):
+                audit.add(Fault.INVALID_RANGE, number, invalid)
             ranges_m = without(ranges_m, self._reading.placeholders)
-            scan = LaserScan(entry.line.stamp, ranges_m, model, T_odom_base)
+            scan = LaserScan(entry.line.stamp, ranges_m, laser.with_beams(entry.beams), T_odom_base)
             watch.add(number, scan)
             yield scan
         self._kept = []  # whoever maps a recording reads its records once
@@ -138,7 +130,9 @@ class TextLog:
                 odometry.add(line.stamp, line.T_odom_base)
             elif gate.admits(number, line.stamp, beams_of(line, declared)):
                 _note_clock(number, line, audit)
-                self._sample(sample, line)
+                if sample.wants(line.T_odom_base):
+                    max_range_m = line.stated.max_range_m if line.stated is not None else SICK_MAX_RANGE_M
+                    sample.add(line.T_odom_base, line.ranges_m, 0.0, max_range_m)
                 scans.add(line.stamp, line.T_odom_base)
                 mounting.add(line)
                 if telling is None or (telling.stated is None and line.stated is not None):
@@ -162,15 +156,6 @@ class TextLog:
             (*(f"{path}: {note}" for note in notes), *placeholder_note(path, placeholders, "")),
         )
         return _Reading(survey, pose_from_odometry, driven.fault is None, placeholders)
-
-    @staticmethod
-    def _sample(sample: RangeSample, line: ScanLine) -> None:
-        if not sample.wants(line.T_odom_base):
-            return
-        max_range_m = line.stated.max_range_m if line.stated is not None else SICK_MAX_RANGE_M
-        with suppress(ValueError):
-            ranges_m = _parse_ranges(line, 0, Audit())
-            sample.add(line.T_odom_base, ranges_m, 0.0, max_range_m)
 
     def _first_look(self) -> Beams:
         audit, scans, parameters = Audit(), list[ScanLine](), dict[str, str]()
@@ -257,18 +242,3 @@ def _sound(lines: Iterable[NumberedLine], audit: Audit) -> Iterator[tuple[int, L
             audit.add(Fault.BROKEN_LINE, number)
         else:
             yield number, line
-
-
-def _parse_ranges(scan: ScanLine, number: int, audit: Audit) -> Ranges:
-    """Ranges in metres, shape (beam_count,), invalid ones NaN; raises ValueError if one is not a number."""
-    values = np.array(scan.range_text.split(), dtype=np.float64)
-    if not (values.min() >= 0.0 and values.max() < _LONGEST_RANGE_M):
-        finite, negative = np.isfinite(values), values < 0.0
-        for kind, count in (
-            (Fault.NON_FINITE_RANGE, np.count_nonzero(~finite)),
-            (Fault.NEGATIVE_RANGE, np.count_nonzero(negative & finite)),
-        ):
-            if count:
-                audit.add(kind, number, int(count))
-        values = np.where(finite & ~negative, np.minimum(values, _LONGEST_RANGE_M), nan)
-    return frozen(values, np.float32)
