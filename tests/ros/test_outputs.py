@@ -5,7 +5,6 @@ import pytest
 
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import frozen
-from fcslam.ros import outputs
 from fcslam.ros.outputs import Grid, Outputs, Region, changed_region
 from fcslam.ros.transform_stream import TransformStream
 from tests.ros.memory_network import MemoryNetwork
@@ -60,8 +59,8 @@ def test_who_takes_no_updates_gets_their_cells_with_the_next_whole_map(network, 
     assert len(network.sent["/robot1/map_updates"]) == 1
 
 
-def test_of_a_large_map_what_differs_from_the_last_whole_one_goes_out(network, published, monkeypatch):
-    monkeypatch.setattr(outputs, "SMALL_MAP_CELLS", 1)
+def test_of_a_large_map_what_differs_from_the_last_whole_one_goes_out(network):
+    published = Outputs(network, "/robot1", "map", "/tf", small_map_cells=1)
     first = np.full((4, 5), Occupancy.UNKNOWN)
     published.map(1, occupancy(first))
     second = first.copy()
@@ -78,9 +77,9 @@ def test_of_a_large_map_what_differs_from_the_last_whole_one_goes_out(network, p
     assert len(network.sent["/robot1/map"]) == 2
 
 
-def test_a_cell_that_changes_back_is_free_at_every_subscriber(network, published, monkeypatch):
+def test_a_cell_that_changes_back_is_free_at_every_subscriber(network):
     """A person stands in a large map and walks on, while another part of it changes."""
-    monkeypatch.setattr(outputs, "SMALL_MAP_CELLS", 1)
+    published = Outputs(network, "/robot1", "map", "/tf", small_map_cells=1)
     cells = [np.full((6, 8), Occupancy.FREE, np.uint8) for _ in range(3)]
     cells[1][1, 1] = Occupancy.OCCUPIED
     cells[2][4, 6] = Occupancy.OCCUPIED
@@ -98,7 +97,7 @@ def test_a_cell_that_changes_back_is_free_at_every_subscriber(network, published
 
 def test_grids_that_cover_other_cells_have_no_region():
     grid = Grid(np.zeros((2, 3), np.int8), 0.05, (0.0, 0.0))
-    assert changed_region(grid, grid) == Region(0, 0, 1, 1)
+    assert changed_region(grid, grid) == Region(0, 0, 0, 0)
     assert changed_region(grid, grid._replace(origin_xy=(1.0, 0.0))) is None
     assert changed_region(grid, grid._replace(values=np.zeros((3, 2), np.int8))) is None
 
@@ -128,12 +127,11 @@ def test_the_path_is_thinned(network, published):
     assert path.poses[-1].pose.position.x == 1.0
 
 
-def test_a_long_path_has_longer_steps(network, published, monkeypatch):
-    monkeypatch.setattr(outputs, "LONGEST_PATH", 50)
-    poses = np.column_stack((np.linspace(0.0, 100.0, 1001), np.zeros((1001, 2))))
-    published.path(1, np.arange(1001.0), poses)
+def test_a_long_path_has_longer_steps(network, published):
+    poses = np.column_stack((np.linspace(0.0, 1000.0, 20_001), np.zeros((20_001, 2))))
+    published.path(1, np.arange(20_001.0), poses)
     (path,) = network.sent["/robot1/path"]
-    assert 45 <= len(path.poses) <= 52
+    assert 3900 <= len(path.poses) <= 5200
 
 
 def test_stamps_grow_between_scans_up_to_the_bound():

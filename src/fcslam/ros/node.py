@@ -189,14 +189,15 @@ class RobotNode:
             is_new = self._outputs.map(stamp_ns, own)
         else:
             is_new = self._outputs.map(stamp_ns, own, OWN_MAP)
-            if not self._publish_joint_map(only_changes=False):
+            if not self.publish_joint_map(only_changes=False):
                 self._outputs.map(stamp_ns, own)
         if is_new or is_finished_map:
             trajectory = self._robot.trajectory()
             self._outputs.path(stamp_ns, trajectory.stamps, trajectory.T_map_base)
             self._outputs.closures(stamp_ns, self._robot.closures())
 
-    def _publish_joint_map(self, only_changes: bool) -> bool:
+    def publish_joint_map(self, only_changes: bool) -> bool:
+        """Publish the joint map, if there is one, as ``Outputs.map``; returns whether there is."""
         joint = self._robot.joint_map()
         if joint is None or self._pose is None:
             return False
@@ -277,20 +278,21 @@ class RobotNode:
         drawn = 0 if self._suggest_pose is None else -1  # a finished map is there before the first scan
         while not self._stop.wait(1.0):
             self.watch_network()
-            self._diagnose()
+            self.diagnose()
             self._save_maps()
             is_due = time.monotonic() >= due_s and self.scans != drawn
             try:
                 if not is_due:
                     if self._robot.fleet is not None:  # what the others see comes in between
-                        self._publish_joint_map(only_changes=True)
+                        self.publish_joint_map(only_changes=True)
                     continue
                 drawn, due_s = self.scans, time.monotonic() + self._parameters.map_update_interval
                 self.publish_map()
             except Exception as error:  # this thread also tells the state of the robot, so it must not end
                 self._tell_once(f"a map cannot be published: {error or type(error).__name__}")
 
-    def _diagnose(self) -> None:
+    def diagnose(self) -> None:
+        """Publish the state of the robot."""
         pose, state = self._pose, self._state
         well = "mapping"
         if pose is None or state is None:

@@ -47,7 +47,6 @@ TRANSFORMED: Final = Quality(reliable=True, depth=100)
 _GRID_VALUES: Final = np.array([-1, 0, 100], np.int8)
 """Values of ROS by ``Occupancy``."""
 SMALL_MAP_CELLS: Final = 1_000_000
-"""Largest number of cells of a map that is published whole at every change."""
 PATH_STEP_M: Final = 0.1
 """Least distance between two poses of the published path."""
 LONGEST_PATH: Final = 5000
@@ -78,17 +77,23 @@ class Region(NamedTuple):
 
 @dataclass(slots=True)
 class _Shown:
-    whole: Grid | None = None
-    """The newest map that was published whole."""
     newest: Grid | None = None
     """The newest map, with its updates."""
+    changed: Region | None = None
+    """Around all cells that changed since a map was published whole; None: nothing did."""
 
 
 class Outputs:
     """The publishers of one robot. Any thread may call."""
 
-    def __init__(self, network: RosNetwork, namespace: str, map_frame: str, tf: str) -> None:
-        """``tf``: topic of the transforms; those without a leading slash are in the namespace."""
+    def __init__(
+        self, network: RosNetwork, namespace: str, map_frame: str, tf: str, small_map_cells: int = SMALL_MAP_CELLS
+    ) -> None:
+        """``tf``: topic of the transforms; those without a leading slash are in the namespace.
+
+        Maps of up to ``small_map_cells`` go out whole at every change.
+        """
+        self._small_map_cells = small_map_cells
         self._network, self._namespace, self._map_frame, self._tf = network, namespace, map_frame, tf
         self._codec = MessageCodec(ros1=False)
         self._lock = threading.Lock()
@@ -188,25 +193,23 @@ class Outputs:
         """Publish a map if it changed; returns whether it did.
 
         A small map goes out whole, unless ``only_changes``: the static layer of Nav2 takes no updates by default. Of a
-        large map, only the cells go out that differ from the last whole one or from the last update. So a late
-        subscriber, who gets the whole one, is complete after any update, and one who got all updates keeps no cell that
-        changed back.
+        large map, all cells that changed since the last whole one go out. So a late subscriber, who gets the whole one,
+        is complete after any update.
         """
         grid = Grid(_GRID_VALUES[occupancy.cells], occupancy.resolution_m, occupancy.origin_xy)
         with self._lock:
             shown = self._begin_map(topic)
-            goes_whole = grid.values.size <= SMALL_MAP_CELLS and not only_changes
-            known = (shown.whole, shown.newest) if goes_whole else (shown.newest,)
-            if all(last is not None and _is_same(last, grid) for last in known):
+            is_whole = grid.values.size <= self._small_map_cells and not only_changes
+            region = None if shown.newest is None else changed_region(shown.newest, grid)
+            if region is not None and not (region.width or (is_whole and shown.changed)):
                 return False
-            before, shown.newest = (shown.whole, shown.newest), grid
-            of_whole, of_newest = (None if each is None else changed_region(each, grid) for each in before)
-            if goes_whole or of_whole is None or of_newest is None:
-                shown.whole = grid
+            shown.newest = grid
+            if is_whole or region is None:
+                shown.changed = None
                 self._send(topic, GRID, self._grid_message(stamp_ns, grid))
             else:
-                region = _bounding(of_whole, of_newest)
-                self._send(topic + UPDATES, GRID_UPDATE, self._update_message(stamp_ns, grid, region))
+                shown.changed = region if shown.changed is None else _bounding(shown.changed, region)
+                self._send(topic + UPDATES, GRID_UPDATE, self._update_message(stamp_ns, grid, shown.changed))
             return True
 
     def fleet(
@@ -348,14 +351,14 @@ class Outputs:
 def changed_region(before: Grid, after: Grid) -> Region | None:
     """The smallest rectangle with all cells that changed; None if the grids do not cover the same cells.
 
-    Equal grids have a region of one cell.
+    That of equal grids has no cell.
     """
     if before[1:] != after[1:] or before.values.shape != after.values.shape:
         return None
     differs = before.values != after.values
     rows, columns = np.flatnonzero(differs.any(axis=1)), np.flatnonzero(differs.any(axis=0))
     if not len(rows):
-        return Region(0, 0, 1, 1)
+        return Region(0, 0, 0, 0)
     x, y = int(columns[0]), int(rows[0])
     return Region(x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1)
 
@@ -375,10 +378,6 @@ def _topic_name(robot: str) -> str:
 def nanoseconds(stamp: float) -> int:
     """A stamp in seconds as ROS counts, not below 0."""
     return max(0, round(stamp * 1e9))
-
-
-def _is_same(before: Grid, after: Grid) -> bool:
-    return before[1:] == after[1:] and np.array_equal(before.values, after.values)
 
 
 def _steps(poses: FloatArray) -> Sequence[int]:
