@@ -343,13 +343,6 @@ def test_a_pose_out_of_all_bounds_is_refused(pose):
         cast([Casting(np.ones(1, np.float32), ONE_BEAM, np.array(pose, np.float64))], CONFIG)
 
 
-def test_what_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match="ranges of shape"):
-        cast([Casting(np.ones(2, np.float32), ONE_BEAM, np.zeros(3))], CONFIG)
-    with pytest.raises(ValueError, match="a pose of shape"):
-        cast([Casting(np.ones(1, np.float32), ONE_BEAM, np.zeros(2))], CONFIG)
-
-
 def test_a_cell_is_known_after_two_passes_and_occupied_by_the_share_of_hits():
     for others, expected in ((5, Occupancy.OCCUPIED), (6, Occupancy.FREE)):
         lengths = [0.5] * others + [0.3]  # the last ends in a cell that the others pass

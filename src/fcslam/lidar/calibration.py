@@ -55,6 +55,9 @@ class Estimate(NamedTuple):
         return abs(self.value - nominal) > max(least, sigmas * self.sigma)
 
 
+Mounting = tuple[Estimate, Estimate, Estimate]
+
+
 @dataclass(frozen=True, slots=True)
 class ScanMotions:
     """The scans of a drive as they were tracked without odometry, N of them."""
@@ -97,7 +100,7 @@ class MotionCalibration:
     """Turn by the scans per turn by odometry."""
     distance_scale: Estimate | None = None
     """Distance by the scans per distance by odometry."""
-    mounting: tuple[Estimate, Estimate, Estimate] | None = None
+    mounting: Mounting | None = None
     """Correction of the pose of the laser, in ``base``: x and y in metres, heading in radians."""
     sweep_share: Estimate | None = None
     """True duration of a sweep per assumed duration."""
@@ -118,15 +121,15 @@ def calibrate(motions: ScanMotions, odometry: OdometryTrack) -> MotionCalibratio
     begins, ends = motions.stamps[pairs.T] + delay.value
     moved = se2.between(odometry.at(begins), odometry.at(ends))
     seen = se2.between(*motions.T_local_base[pairs.T])
-    fit = _fit(moved, seen, moved[:, 2] * (1.0 if turn_scale is None else turn_scale.value))
-    distance_scale = _distance_scale(fit.scale, moved, seen)
+    scale, mounting, residual_m = _fit(moved, seen, moved[:, 2] * (1.0 if turn_scale is None else turn_scale.value))
+    distance_scale = _distance_scale(scale, moved, seen)
     scales = MotionCalibration(turn_scale=turn_scale, distance_scale=distance_scale)
     is_known = distance_scale.sigma <= LARGEST_SIGMA * distance_scale.value
-    is_measure, is_long = is_known and fit.residual_m <= LARGEST_RESIDUAL_M, len(pairs) >= FEWEST_MOTIONS
+    is_measure, is_long = is_known and residual_m <= LARGEST_RESIDUAL_M, len(pairs) >= FEWEST_MOTIONS
     if turns < FEWEST_TURNS or (is_long and not is_measure):
         return scales
     timed = replace(scales, delay=delay, sweep_share=_sweep_share(motions, odometry, delay.value))
-    return replace(timed, mounting=fit.mounting) if is_long else timed
+    return replace(timed, mounting=mounting) if is_long else timed
 
 
 def _pairs(motions: ScanMotions) -> Pairs:
@@ -181,14 +184,7 @@ def _sweep_share(motions: ScanMotions, odometry: OdometryTrack, delay_s: float) 
     return Estimate(float(share), float(np.sqrt(covariance[0, 0])))
 
 
-class _Fit(NamedTuple):
-    scale: Estimate
-    mounting: tuple[Estimate, Estimate, Estimate]
-    residual_m: float
-    """Standard deviation of a coordinate."""
-
-
-def _fit(moved: FloatArray, seen: FloatArray, turned: FloatArray) -> _Fit:
+def _fit(moved: FloatArray, seen: FloatArray, turned: FloatArray) -> tuple[Estimate, Mounting, float]:
     """Linear least squares of ``(R_m - I) c' + m = R(g) b / s``, with c = s c' and C = (c, g).
 
     Motions m and b between the same scans, shape (P, 3), are ``moved`` and ``seen``; R_m turns by ``turned``, shape
@@ -208,7 +204,7 @@ def _fit(moved: FloatArray, seen: FloatArray, turned: FloatArray) -> _Fit:
         Estimate(float(np.arctan2(b, a)), sigma),
     )
     residual_m = 1.4826 * float(np.median(np.abs(target - design @ (x, y, a, b))))
-    return _Fit(Estimate(scale, scale * sigma), mounting, residual_m)
+    return Estimate(scale, scale * sigma), mounting, residual_m
 
 
 def _distance_scale(forward: Estimate, moved: FloatArray, seen: FloatArray) -> Estimate:
@@ -217,7 +213,7 @@ def _distance_scale(forward: Estimate, moved: FloatArray, seen: FloatArray) -> E
     Errors of ``seen`` make the scale of one fit too large, as where a corridor hides the motion along it, and that of
     the other too small. The true one is anywhere between them.
     """
-    backward = 1.0 / _fit(seen, moved, seen[:, 2]).scale.value
+    backward = 1.0 / _fit(seen, moved, seen[:, 2])[0].value
     sigma = np.hypot(forward.sigma, (forward.value - backward) / np.sqrt(12.0))
     return Estimate(float(np.sqrt(forward.value * backward)), float(sigma))
 

@@ -67,6 +67,8 @@ class Facing(NamedTuple):
 
 
 AS_STATED: Final = Facing()
+_Pair = tuple[LaserScan, LaserScan]
+"""Two scans of one laser with a motion between them."""
 
 
 class Contradiction(NamedTuple):
@@ -110,13 +112,6 @@ class Contradiction(NamedTuple):
         )
 
 
-class ScanPair(NamedTuple):
-    """Two scans of one laser with a motion between them."""
-
-    before: LaserScan
-    after: LaserScan
-
-
 def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
     """How a laser faces if it is certainly not as stated; None if the scans fit the odometry or say nothing.
 
@@ -155,7 +150,7 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
 def part_agreement(scans: Iterable[LaserScan], part: Callable[[LaserScan], LaserScan]) -> float:
     """Mean agreement, 0 to 1, of a part of each scan with the scan before a move; NaN if few scans have it."""
     moves, _ = _pairs(islice(scans, MOST_COMPARED))
-    found = np.array([_agreement(ScanPair(before, part(after)), AS_STATED) for before, after in moves])
+    found = np.array([_agreement((before, part(after)), AS_STATED) for before, after in moves])
     found = found[np.isfinite(found)]
     return float(found.mean()) if len(found) >= FEWEST_PAIRS else math.nan
 
@@ -177,7 +172,7 @@ class FacingWatch:
 class _Trial:
     """Pairs of scans on which mountings are compared; those with a turn count as much as those with a move."""
 
-    def __init__(self, moves: list[ScanPair], turns: list[ScanPair]) -> None:
+    def __init__(self, moves: list[_Pair], turns: list[_Pair]) -> None:
         kinds = [moves, turns] if min(len(moves), len(turns)) >= FEWEST_PAIRS else [[*moves, *turns]]
         self.pairs = [pair for kind in kinds for pair in kind]
         self._weights = np.array([1.0 / len(kind) for kind in kinds for _ in kind])
@@ -203,9 +198,9 @@ class _Trial:
         return is_clear or gain > max(least, SIGMAS * sigma)
 
 
-def _pairs(scans: Iterable[LaserScan]) -> tuple[list[ScanPair], list[ScanPair]]:
-    moves: list[ScanPair] = []
-    turns: list[ScanPair] = []
+def _pairs(scans: Iterable[LaserScan]) -> tuple[list[_Pair], list[_Pair]]:
+    moves: list[_Pair] = []
+    turns: list[_Pair] = []
     first: LaserScan | None = None
     for scan in scans:
         if first is None or not 0.0 <= scan.stamp - first.stamp <= LONGEST_S:
@@ -215,7 +210,7 @@ def _pairs(scans: Iterable[LaserScan]) -> tuple[list[ScanPair], list[ScanPair]]:
         if has_moved or has_turned:
             pairs = turns if has_turned else moves
             if len(pairs) < MOST_PAIRS:
-                pairs.append(ScanPair(first, scan))
+                pairs.append((first, scan))
             first = scan
         if len(moves) == len(turns) == MOST_PAIRS:
             break
@@ -227,7 +222,7 @@ def _moved(first: LaserScan, scan: LaserScan) -> tuple[bool, bool]:
     return math.hypot(x, y) > LEAST_MOVE_M, abs(theta) > LEAST_TURN_RAD
 
 
-def _agreement(pair: ScanPair, facing: Facing) -> float:
+def _agreement(pair: _Pair, facing: Facing) -> float:
     """Mean agreement, 0 to 1, of the points of the later scan with the earlier one; NaN if too few are in its view."""
     before, after = pair
     T_base_laser = se2.compose(before.laser.T_base_laser, (0.0, 0.0, math.radians(facing.turned_deg)))

@@ -1,18 +1,15 @@
 """Detection of a lost robot: its newest scans are compared with its newest keyscans.
 
-A robot that was picked up and put down elsewhere, or whose odometry failed, sees another place than its last keyscans
-did. A single scan that explains little of the known area may come from a crowd or an opened door. So doubtful scans are
-deferred until they are enough for a submap of their own; two submaps that contradict each other show two places.
+A robot that was picked up, or whose odometry failed, sees another place than its last keyscans did. A single scan that
+explains little may come from a crowd or an opened door. So doubtful scans are deferred until they are enough for a
+submap of their own; two submaps that contradict each other show two places. A robot that leaves a closed cabin may be
+on another floor, where much looks alike: all its scans from the opening of the door on are deferred.
 
-A robot that leaves a closed cabin may be on another floor, where much looks alike. So all its scans from the opening of
-the door on are deferred, and compared with those from before the door closed.
-
-A robot whose scans stopped while it drove on is lost, too: nobody saw the way. Without odometry, nothing shows the
-motion in a gap of the scans. The scans after it are looked for in the map of the keyscans before it. The robot is lost
-unless they fit there in one way only, or agree with the map where they were matched.
+Without odometry, nothing shows the motion in a gap of the scans. The robot is lost unless the scans after it fit the
+map in one way only, or agree with it where they were matched.
 
 The newest keyscans may contradict the scans although the robot drove on, as after a match to the ground. Then the scan
-before and one of the doubtful ones show one place, where odometry says. Such a robot only needs another local map.
+before and one of the doubtful ones show one place, where odometry says: only another local map is needed.
 """
 
 import math

@@ -121,12 +121,9 @@ class _Points(NamedTuple):
 
 
 class _Loss(NamedTuple):
-    scale: float
-    """Scale of the loss, metres."""
-    clutter: float
-    """The same for points without a normal."""
-    new_weight: float
-    """Weight of points on new surfaces."""
+    scale: float  # metres
+    clutter: float  # the same for points without a normal
+    new_weight: float  # of points on new surfaces
 
 
 @njit
@@ -190,19 +187,16 @@ def solve(A, b):  # type: ignore[no-untyped-def]
 
 
 class _Equations(NamedTuple):
-    """Normal equations over the pose, without the velocity, in units of ``POINT_SIGMA_M``."""
+    """Normal equations over the pose, without the velocity, in units of ``POINT_SIGMA_M``.
 
-    H: FloatArray
-    """Shape (3, 3)."""
-    g: FloatArray
-    """Shape (3,)."""
-    mixed: FloatArray
-    """Block of pose and velocity, shape (3, 3)."""
-    own: FloatArray
-    """Block of the velocity, with its prior, shape (3, 3)."""
-    reduced: FloatArray
-    """Shape (4, 3): the velocity that minimises the cost is moved by row 3 less the step of the pose times rows 0 to
-    2."""
+    The velocity that minimises the cost is moved by row 3 of ``reduced`` less the step of the pose times rows 0 to 2.
+    """
+
+    H: FloatArray  # (3, 3)
+    g: FloatArray  # (3,)
+    mixed: FloatArray  # (3, 3): block of pose and velocity
+    own: FloatArray  # (3, 3): block of the velocity, with its prior
+    reduced: FloatArray  # (4, 3)
 
 
 @njit(allocates=False)

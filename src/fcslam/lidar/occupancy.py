@@ -232,11 +232,6 @@ def classify(grid: OccupancyGrid) -> Cells:
 
 
 def _stacked(keyscans: list[Casting], laser: LaserModel, times: Sweep, longest_m: float) -> _Beams:
-    for ranges_m, _, T_map_base, _ in keyscans:
-        if np.shape(ranges_m) != (laser.beam_count,):
-            raise ValueError(f"ranges of shape {np.shape(ranges_m)} from a laser of {laser.beam_count} beams")
-        if np.shape(T_map_base) != (3,):
-            raise ValueError(f"a pose of shape {np.shape(T_map_base)}, expected (3,)")
     ranges_m = np.array([scan.ranges_m for scan in keyscans], np.float32)
     poses = np.array([scan.T_map_base for scan in keyscans])
     if not (np.abs(poses) < FARTHEST_M).all():  # false for NaN
