@@ -14,7 +14,6 @@ from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.report import fuse_members
 from fcslam.errors import SourceError
 from fcslam.graph.pose_graph import Edge, PoseGraph
-from fcslam.lidar.field import SurfelField
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.occupancy_map import Occupancy, map_yaml, pgm_bytes
 from tests.planned_building import OTHER_WALLS, WALLS, mapped, plan_of
@@ -180,12 +179,6 @@ def test_a_plan_with_more_walls_than_a_field_holds_gets_one_line(tmp_path):
     with pytest.raises(SourceError, match=r"hatched.png: has too many walls; at most 1.6 km can be used; crop it"):
         read_anchors(tmp_path / "hatched.png", 0.02)
     assert read_anchors(picture(tmp_path), 0.02).plan is not None
-
-
-def test_a_map_with_more_walls_than_a_field_holds_is_not_aligned(monkeypatch):
-    plan = plan_of()
-    monkeypatch.setattr(SurfelField, "is_full", True)
-    assert "too many walls" in report_of(placed(mapped()[0], plan))["reason"]
 
 
 def test_a_robot_whose_ranges_stay_with_it_is_placed_with_the_others_of_its_map():

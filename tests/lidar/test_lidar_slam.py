@@ -26,12 +26,11 @@ class Mapped:
     def __init__(self, scans, config=None):
         config = config or LidarConfig()
         frontend, self.backend = LidarFrontend("r", config), LidarBackend("r", config)
-        self.steps, self.stored, self.submaps = [], [], []
+        self.steps, self.submaps = [], []
         for scan in scans:
             self.steps.append(step := frontend.process(scan))
             if step.keyscan is not None:
                 self.submaps += filter(None, [self.backend.add(step.keyscan)])
-            self.stored.append(len(self.backend._window))
         self.submaps += self.backend.finish()
         anchors = [submap.anchor for submap in self.submaps]
         mapped = [step.keyscan for step in self.steps if step.keyscan is not None]
@@ -130,12 +129,6 @@ def test_the_same_recording_gives_the_same_bytes(scans, mapped):
         assert one.information.tobytes() == other.information.tobytes()
 
 
-def test_scans_are_forgotten_once_no_submap_needs_them(mapped):
-    """Two reaches of 5 m and the 2 m to the next anchor, at a keyscan each 0.25 m or turn: it does not grow."""
-    assert max(mapped.stored[300:]) <= 1.1 * max(mapped.stored[:300])
-    assert max(mapped.stored) < 100
-
-
 def test_information_of_a_motion_turns_with_the_robot():
     """Well fixed across, badly along the local y axis: seen from a robot that faces it, along is its own x."""
     information = np.diag((1e6, 1e1, 1e6))
@@ -206,17 +199,11 @@ def test_motions_combined_solve_as_the_keyscans_between_would():
     np.testing.assert_allclose(reduced, whole, atol=3e-4)
 
 
-def test_a_well_known_area_holds_no_more_submaps_however_often_it_is_crossed():
-    """A robot that goes to and fro on one spot's surroundings; what it forgets costs no closure of the newest visit."""
+def test_what_is_forgotten_of_a_well_known_area_costs_no_closure_of_the_newest_visit():
     truth = drive([(1.5, 1.5), (6.0, 1.5)] * 9)
     mapped = Mapped(recording(truth, truth, ring()))
-    anchors = mapped.backend._poses[list(mapped.backend._closer._held)]
-    squares, counts = np.unique(np.floor(anchors[:, :2] / 2.0 + 0.5), axis=0, return_counts=True)
-    assert counts.max() <= MOST_NEARBY + 1  # the graph is solved afterwards, and moves some across an edge
-    assert len(anchors) < len(mapped.submaps)
-    newest = mapped.submaps[-6:]
-    assert len(squares) >= 3
-    assert all(submap.closures for submap in newest)
+    assert len(mapped.submaps) > 3 * MOST_NEARBY
+    assert all(submap.closures for submap in mapped.submaps[-6:])
     assert pose_errors(mapped.poses, truth)[0].max() < 0.05
 
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.lidar.field import TABLE
 from fcslam.lidar.odometry import WHEELS, odometry_error
-from fcslam.lidar.tracker import BUFFER_KEYSCANS, ScanTracker
+from fcslam.lidar.tracker import ScanTracker
 from fcslam.records import LaserModel, frozen
 from tests.lidar.worlds import (
     LASER,
@@ -193,24 +192,6 @@ def test_somebody_who_walks_by_does_not_take_the_robot_along(truth, odometry):
         scans[-1] = replace(scans[-1], stamp=scan.stamp)
     shift, _ = pose_errors(track(scans)[0], truth[:200])
     assert shift.max() < 0.10
-
-
-@pytest.mark.slow
-def test_the_buffer_does_not_grow_with_the_drive(truth):
-    """A drive twice as long needs no more: at most two fields, each as large as the stretch it holds."""
-
-    def memory(rounds):
-        poses = ring_drive(rounds)
-        _, tracker = track(recording(poses, se2.between(poses[0], poses), ring(), noise_m=0.005))
-        fields = [field for field, _ in tracker._fields]
-        assert len(fields) <= 2
-        assert all(count <= BUFFER_KEYSCANS for _, count in tracker._fields)
-        assert all(field.arrays.table.shape == (TABLE, TABLE) for field in fields)
-        return max(len(field.points) for field in fields), max(field.arrays.labels.nbytes for field in fields)
-
-    once, twice = memory(0.7), memory(1.4)
-    assert twice[0] < 1.3 * once[0]
-    assert twice[1] <= 2 * once[1]
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 1.0])

@@ -1,14 +1,11 @@
 """Tiles of a map: every zoom shows the same map, however large it is."""
 
-import os
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 import pytest
 
-from fcslam.maps import tiles
 from fcslam.maps.occupancy_map import PIXELS, Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.maps.tiles import TILE_PX, WORLD_M, finest_zoom, tile_png
 
@@ -65,35 +62,8 @@ def test_no_zoom_is_finer_than_the_cells():
     assert WORLD_M / TILE_PX / 2 ** finest_zoom(RESOLUTION_M) <= RESOLUTION_M
 
 
-@pytest.fixture
-def read(monkeypatch):
-    """The stems of the maps that were read, and no map in memory before."""
-    stems, parse = [], tiles.parse_image
-
-    def parsed(stem, *files):
-        stems.append(stem)
-        time.sleep(0.05)
-        return parse(stem, *files)
-
-    monkeypatch.setattr(tiles, "parse_image", parsed)
-    monkeypatch.setattr(tiles, "_kept", type(tiles._kept)())
-    return stems
-
-
 @pytest.mark.usefixtures("grid")
-def test_a_map_is_read_once_for_many_requests_at_once(tmp_path, read):
+def test_many_requests_at_once_get_what_each_gets_alone(tmp_path):
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda column: tile_png(tmp_path, "map", 4, column, 0), range(8)))
-    assert read == ["map"]
-
-
-@pytest.mark.usefixtures("grid")
-def test_older_versions_of_a_large_map_leave_the_memory(tmp_path, read, monkeypatch):
-    monkeypatch.setattr(tiles, "KEPT_BYTES", 4_000_000)  # a version has 2.9 MB
-    for version in range(4):
-        os.utime(tmp_path, (version, version))
-        tile_png(tmp_path, "map", 0, 0, 0)
-    assert len(read) == 4
-    assert len(tiles._kept) == 1
-    tile_png(tmp_path, "map", 3, 0, 0)
-    assert len(read) == 4, "the newest one stays"
+        at_once = list(pool.map(lambda column: tile_png(tmp_path, "map", 4, column, 0), range(8)))
+    assert at_once == [tile_png(tmp_path, "map", 4, column, 0) for column in range(8)]

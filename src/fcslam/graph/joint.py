@@ -156,9 +156,7 @@ def solve_jointly(
             trusted = replace(solution, weights=solution.weights * ~isolated)
             solution = _refine_inliers(factors, within_maps, trusted)
         # 6. Repeat without the links that the joint solution contradicts.
-        confirmed = [
-            link for link in joining if _is_confirmed(link, paths, solution, evidence.informative, consistency)
-        ]
+        confirmed = [link for link in joining if is_confirmed(link, paths, solution, evidence.informative, consistency)]
         # 7. Robots that alone join maps that contradict each other leave them.
         if len(confirmed) == len(joining):
             bridges = _false_bridges(evidence, solution, senders, compare)
@@ -348,7 +346,7 @@ def _distance_to_next_closure_m(
     return distance
 
 
-def _is_confirmed(
+def is_confirmed(
     link: Link,
     own: Sequence[Trajectory],
     solution: Solution,

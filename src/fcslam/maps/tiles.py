@@ -2,8 +2,8 @@
 
 import math
 import threading
-from collections import OrderedDict
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -18,8 +18,8 @@ WORLD_M = 512.0
 """Side of a tile at zoom 0; each zoom halves it."""
 TILE_PX = 512
 DEEPEST_ZOOM = 8
-KEPT_BYTES = 256_000_000
-"""Size of maps kept in memory; the one that was asked for last stays, however large it is."""
+MAPS_KEPT = 4
+"""Maps kept in memory, at most 85 MB each."""
 
 
 def finest_zoom(resolution_m: float) -> int:
@@ -74,21 +74,15 @@ class _Pyramid:
 
 _lock = threading.Lock()
 """Many tiles are asked for at once: one request reads the map, the others wait for it."""
-_kept: OrderedDict[tuple[Path, str, tuple[int, int]], _Pyramid] = OrderedDict()
-"""The one that was asked for last is the last."""
 
 
 def _pyramid(folder: Path, stem: str) -> _Pyramid:
-    key = (folder, stem, identity(folder))
     with _lock:
-        found = _kept.pop(key) if key in _kept else _read(folder, stem)
-        _kept[key] = found
-        while len(_kept) > 1 and sum(level.nbytes for one in _kept.values() for level in one.levels) > KEPT_BYTES:
-            _kept.popitem(last=False)
-    return found
+        return _read(folder, stem, identity(folder))
 
 
-def _read(folder: Path, stem: str) -> _Pyramid:
+@lru_cache(MAPS_KEPT)
+def _read(folder: Path, stem: str, _version: tuple[int, int]) -> _Pyramid:
     pgm, description = read_bytes(folder / f"{stem}.pgm", folder), read_text(folder / f"{stem}.yaml", folder)
     image = parse_image(stem, pgm, description)
     levels: list[NDArray[np.uint8]] = [cv2.LUT(image.pixels, pixels_of(image.meaning))]
