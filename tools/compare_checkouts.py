@@ -74,8 +74,10 @@ def cases(data: Path, work: Path) -> Iterator[Case]:
     yield Case("cameras", ("map", *fleet, "--output", "{output}"))
     robots = [str(data / "vision" / name) for name in ("kodak24", "sun_hays80")]
     start = Path(__file__).parents[1] / "src" / "fcslam" / "features" / "networks" / "detector.onnx"
-    given = ("--public", str(data / "vision" / "urban100"), "--start", str(start), "--quick", "--config", "rounds=2")
-    yield Case("federated", ("tools", "federate", *robots, *given, "--output", "{output}"))
+    given = ("--public", str(data / "vision" / "urban100"), "--start", str(start))
+    settings = "rounds=2", "local_steps=6", "training={pairs: 2, side_px: 96, label_copies: 2}"
+    brief = (word for setting in settings for word in ("--config", setting))
+    yield Case("federated", ("tools", "federate", *robots, *given, *brief, "--output", "{output}"))
 
 
 def make_bags(data: Path, checkout: Path, work: Path) -> None:

@@ -220,7 +220,7 @@ def test_images_and_times_of_beams_are_kept(tmp_path):
 
 def test_what_convert_refuses(tmp_path, bag, capsys):
     for name in ("a.zip", "a.clf"):
-        assert f"{name}: unknown format" in refused(capsys, "record", bag, "-o", tmp_path / name)
+        assert f"{name}: not a kind of bag" in refused(capsys, "record", bag, "-o", tmp_path / name)
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "main.tex").touch()
     assert "not a recording" in refused(capsys, "record", bag, "-o", tmp_path / "thesis", "--force")

@@ -122,9 +122,3 @@ def completed(line):
 )
 def test_shells_complete_commands_options_and_choices_and_themselves_files(line, offered):
     assert completed(line) == (offered, "[]")
-
-
-@pytest.mark.parametrize(("name", "hint"), [("simulate", "Did you mean 'tools simulate'?"), ("simulat", "simulat'.\n")])
-def test_a_command_of_the_tools_is_found_from_the_top(name, hint, capsys):
-    assert main([name]) == 2
-    assert hint in capsys.readouterr().err

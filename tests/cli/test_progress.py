@@ -35,7 +35,7 @@ def test_bar_count_and_time_fit_80_columns():
         line = terminal.render_lines(display._bars.get_renderable(), terminal.options)[0]
         text = "".join(segment.text for segment in line)
     assert len(text) == 80
-    assert re.match(r"mapping [━╸╺ ]{16} 999/1000 0:00:0\d left 290 x real time", text)
+    assert re.match(r"mapping [━╸╺ ]{16}  ?999/1000 0:00:0\d 0:00:0\d 290 x real time", text)
     assert "…" in text
 
 
@@ -44,7 +44,7 @@ def test_long_names_leave_room():
     with ProgressDisplay(terminal) as display:
         display.show("a stage with a name that nobody should give it", 12345, 123456, DETAILS)
         text = "".join(s.text for s in terminal.render_lines(display._bars.get_renderable(), terminal.options)[0])
-    assert "12345/123456 -:--:-- left" in text
+    assert "12345/123456 0:00:00 -:--:--" in text
 
 
 def test_without_a_terminal_plain_lines_come_even_if_nothing_happens():
@@ -54,7 +54,7 @@ def test_without_a_terminal_plain_lines_come_even_if_nothing_happens():
         first, *lines = wait_for_lines(pipe, 4)
     assert first == "output: runs/now"
     assert len(lines) >= 3
-    assert {re.sub(r"[\d:-]+ left", "T left", line) for line in lines} == {"mapping 12/40, T left, 3 closures"}
+    assert {re.sub(r"\d+:[\d:]+|-:--:--", "T", line) for line in lines} == {"mapping 12/40, T, T left, 3 closures"}
 
 
 def test_a_stage_of_unknown_length_shows_its_count_and_the_time_it_took():
@@ -66,7 +66,7 @@ def test_a_stage_of_unknown_length_shows_its_count_and_the_time_it_took():
         advance()
         advance()
         lines = wait_for_lines(pipe, 1)
-    assert re.fullmatch(r"describing 2, 0:00:\d\d", lines[-1])
+    assert re.fullmatch(r"describing 2/\?, 0:00:\d\d", lines[-1])
 
 
 def test_a_stage_that_starts_again_counts_again():

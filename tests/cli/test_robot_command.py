@@ -80,9 +80,6 @@ def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     ("arguments", "reason"),
     [
         (["--server", "cloud"], "not the address of a cloud"),
-        (["--speed", "fast"], "--speed 'fast' is not a speed"),
-        (["--speed", "-1"], "is not a speed"),
-        (["--speed", "nan"], "is not a speed"),
         (["--credentials", "nowhere"], "holds no credentials"),
         (["--credentials", "{token: two words}"], "holds no token"),
         (["--credentials", "{client.pem: x}"], "client.pem and client.key belong together"),
@@ -190,7 +187,7 @@ def test_a_robot_that_waits_for_a_dead_server_says_so_and_shows_what_waits():
             watch(now)
         time.sleep(0.2)
     text = console.file.getvalue()
-    assert text.count("all scans are mapped; 7 packets wait for the server") == 1
+    assert text.count("all scans are mapped, and packets wait for the server") == 1
     assert re.search(r"sending 0/7, .*offline, 7 waiting", text)
 
 

@@ -6,11 +6,10 @@ import math
 import os
 import sys
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import click
 import typer
-from typer.core import TyperGroup
 
 import fcslam
 from fcslam.cli import (
@@ -34,7 +33,6 @@ from fcslam.cli import map as mapping
 from fcslam.cli import play as playback
 from fcslam.cli import robot as robots
 from fcslam.cli import warm_up as warming
-from fcslam.cli.inputs import SENSOR_KEYS
 from fcslam.errors import FcslamError, InputError, printable
 
 BAD_INPUT, INTERRUPTED, READER_GONE = 2, 130, 1
@@ -54,19 +52,8 @@ COMPLETION_VARIABLE = "_FCSLAM_COMPLETE"
 """Environment variable by which a shell asks for completions instead of running the command."""
 
 
-class _Commands(TyperGroup):
-    """The commands; the error about one of ``fcslam tools`` names its place."""
-
-    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
-        group = self.commands.get("tools")
-        if args and args[0] not in self.commands and isinstance(group, click.Group) and args[0] in group.commands:
-            ctx.fail(f"No such command '{args[0]}'. Did you mean 'tools {args[0]}'?")
-        return super().resolve_command(ctx, args)
-
-
 app = typer.Typer(
     name=PROGRAM,
-    cls=_Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -101,14 +88,11 @@ COMMANDS: dict[str, tuple[str, Callable[..., None] | typer.Typer]] = {
 EXAMPLES = """\
 fcslam map robot1.clf.gz robot2.clf.gz
 fcslam map anna=run1.bag ben=run2.mcap -o runs/building
-fcslam map today.bag --onto runs/building -o runs/building-2
 fcslam map --onto runs/building -o runs/building-edited
 fcslam info robot1.mcap --json
 fcslam show runs/building
-fcslam show runs/building --port 8350 --no-open
 fcslam robot ros2:/robot1 -o runs/robot1
 fcslam robot ros2:/robot1 --server https://hub --state s --credentials c
-fcslam robot anna=ros2:/robot1 --sensors scan-topic=/front/scan
 fcslam play robot1.clf.gz --server http://127.0.0.1:8340 --state state
 fcslam play robot1.bag --server https://cloud:8340 --state s --credentials c
 fcslam localize ros2:/robot1 --map office.yaml --initial-pose 2,3.5,1.57
@@ -116,10 +100,8 @@ fcslam localize ros2:/robot1 --server http://127.0.0.1:8340 --map copy
 fcslam edit list runs/building
 fcslam edit undo runs/building 2
 fcslam edit veto runs/building anna 1000.0 ben 1000.001
-fcslam edit veto runs/building anna ben
 fcslam edit pin runs/building anna 1000.0 ben 1000.001
 fcslam edit close runs/building anna 1000.0 ben 1000.001 --pose 0.5,0,3.1
-fcslam edit remove runs/building ben+1
 fcslam edit remove runs/building ben --from 1010 --to 1025
 fcslam edit floor runs/building anna+1 2
 fcslam edit erase runs/building "1,2 3,2 3,4 1,4"
@@ -130,20 +112,15 @@ fcslam edit place runs/building --to-walls
 fcslam edit place runs/building --at anna,1000.5=3,4,1.57
 fcslam edit place runs/building --match 1.5,2=0,0 --match 9,2.5=7.5,0
 fcslam record ros2:/robot1 -o day.mcap
-fcslam record ros2:/ -o day.mcap --duration 600
 fcslam record robot1.clf.gz -o robot1.bag
-fcslam record robot2.bag -o robot2.mcap --sensors scan-topic=/front/scan
 fcslam serve --data cloud --host 0.0.0.0 --credentials credentials
 fcslam demo --robots 4 --no-camera -o demo4
 fcslam evaluate fleet fleet/run --truth fleet
-fcslam evaluate fleet demo/run --csv fleet.csv
 fcslam evaluate relations runs/intel intel.relations.gz
 fcslam evaluate quality fleet/run
 fcslam tools simulate --building office --no-camera
 fcslam tools simulate --lighting day --lighting evening -c moved_furniture=0.3
-fcslam tools simulate --robots 20 --building office -o office
 fcslam tools changes runs/building --since 2026-11-20 -o changes/week
-fcslam tools config > mission.yaml
 fcslam tools config paper > paper.yaml
 fcslam tools certificates --host cloud.local --robot robot1 --admin boss
 fcslam tools warm-up
@@ -212,8 +189,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return READER_GONE
         return _fail(f"standard output cannot be written ({error.strerror}); make room", BAD_INPUT)
     except click.ClickException as error:
-        if isinstance(error, click.NoSuchOption) and (key := error.option_name.lstrip("-")) in SENSOR_KEYS:
-            error.possibilities = [f"--sensors {key}=..."]
         error.show()
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):

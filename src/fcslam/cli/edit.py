@@ -229,7 +229,6 @@ def place(
 
 
 def _decide(mission: Path, decision: "Veto | Pin") -> None:
-    """Append a decision about closures; a run folder says which closures there are."""
     from fcslam.mission.map_edits import check_closure
     from fcslam.runs import open_run
 
@@ -261,7 +260,6 @@ def _opened(folder: Path) -> "tuple[Run, SavedMission]":
 
 
 def _append(path: Path, content: "Change | Undo") -> None:
-    """Append an edit, and say what to do next."""
     from fcslam.mission.mission_file import edit_mission
 
     try:

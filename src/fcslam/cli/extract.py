@@ -10,11 +10,6 @@ from fcslam.cli.output import FEATURES, new_folder, notices, print_line
 from fcslam.errors import FeatureError
 from fcslam.features.detector_kinds import DetectorKind
 
-LONGEST_SIDE_PX = 2048
-"""Larger images are shrunk to this longest side."""
-SCALES = (1.0, 0.71, 0.5)
-"""Scales of the image pyramid of a network."""
-
 
 def extract(
     images: Annotated[Path, typer.Argument(help="An image, or a folder of images, searched with its subfolders.")],
@@ -38,13 +33,14 @@ def extract(
 
     named = detector in list(DetectorKind)
     kind = DetectorKind(detector) if named else DetectorKind.ONNX
-    onnx = OnnxConfig(weights=None if named else Path(detector), most_features=keypoints, scales=SCALES)
+    onnx = OnnxConfig(weights=None if named else Path(detector), most_features=keypoints, scales=(1.0, 0.71, 0.5))
     finder = make_detector(kind, OrbConfig(most_features=keypoints), onnx)
     files = [path for path in find_files(images) if path.suffix != ".npz"]  # an earlier output may be among them
     root = images.parent if images.is_file() else images
     output = output or new_folder(FEATURES)
     console, done, empty = notices(), 0, 0
-    outcomes = extract_all(files, root, output, finder, LONGEST_SIDE_PX)
+    longest_side_px = 2048  # of larger images, which are shrunk
+    outcomes = extract_all(files, root, output, finder, longest_side_px)
     with ProgressDisplay(console) as display:
         extracted_one = display.start("extracting", len(files))
         for outcome in outcomes:

@@ -9,24 +9,11 @@ import typer
 
 from fcslam.cli.options import SettingsFiles, chosen_settings, output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, print_line
-from fcslam.cli.training_options import (
-    QUICK_IMAGES,
-    TRAINING_OUTPUT,
-    Quick,
-    Start,
-    compute_budget,
-    require_training_libraries,
-)
+from fcslam.cli.training_options import TRAINING_OUTPUT, Start, compute_budget, require_training_libraries
 
 if TYPE_CHECKING:
     from fcslam.learning.federated.rounds import RoundReport
 
-QUICK: dict[str, object] = {
-    "rounds": 3,
-    "local_steps": 6,
-    "training": {"pairs": 2, "side_px": 96, "label_copies": 2},
-}
-"""Settings of ``--quick``: every stage runs, none long enough to learn much."""
 SHOWN = {
     "detector": "loss_detector",
     "contrastive": "loss_contrastive",
@@ -50,26 +37,22 @@ def federate(
         list[Path] | None,
         typer.Option(help="Folder of public images, on which detectors are evaluated. Can be repeated."),
     ] = None,
-    quick: Quick = False,
 ) -> None:
     """Train one detector on the images of several robots, simulated in this process. No image leaves its robot.
 
     The robots of a service train with `fcslam serve --learn`.
     """
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.config import changed
     from fcslam.learning.federated.settings import FederatedSettings
 
-    base = FederatedSettings()
-    settings = chosen_settings(changed(base, QUICK, "--quick") if quick else base, config)
+    settings = chosen_settings(FederatedSettings(), config)
     require_training_libraries("flwr", extra="federated")
     from fcslam.learning.federated.coordinator import RoundRules
     from fcslam.learning.federated.flower import flower_aggregate
     from fcslam.learning.federated.job import FederatedJob, federate_locally
 
-    console, aggregate = notices(), flower_aggregate(settings.strategy)
-    rules = RoundRules(aggregate, judge_every=1) if quick else RoundRules(aggregate)
-    where, device = output or new_folder(TRAINING), compute_budget(quick).device
+    console, rules = notices(), RoundRules(flower_aggregate(settings.strategy))
+    where, device = output or new_folder(TRAINING), compute_budget().device
     job = FederatedJob(where, settings, start, tuple(public or ()), rules, device)
     began = time.perf_counter()
     with ProgressDisplay(console, f"output: {job.output}") as display:
@@ -81,7 +64,7 @@ def federate(
             display.show("rounds", report.round_number, settings.rounds)
             print_line(console, round_line(report.row(), settings.rounds))
 
-        files = federate_locally(folders, job, on_round, on_step, QUICK_IMAGES if quick else None)
+        files = federate_locally(folders, job, on_round, on_step)
     for file in files:
         typer.echo(str(file))
     print_line(console, f"{time.perf_counter() - began:.0f} s")

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from fcslam.sources import BagOptions
     from fcslam.sources.inspection import Inspection, LaserContents
 
-GAPS_SHOWN = 3
-
 
 def info(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording in any known format.")],
@@ -125,7 +123,7 @@ def _lines(found: "Inspection") -> "Iterator[str]":
         camera = found.camera
         yield f"camera: {found.images} images of {camera.width} x {camera.height} pixels"
     if found.gaps:
-        longest = sorted(found.gaps, key=lambda gap: -gap.length_s)[:GAPS_SHOWN]
+        longest = sorted(found.gaps, key=lambda gap: -gap.length_s)[:3]
         shown = ", ".join(f"{gap.length_s:.1f} s after {gap.after_s:.1f} s" for gap in longest)
         yield f"gaps without scans: {len(found.gaps)}; the longest: {shown}"
     if found.steps_back:

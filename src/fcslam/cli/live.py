@@ -24,12 +24,8 @@ if TYPE_CHECKING:
     from fcslam.live.records import RobotEvent, RobotPose
     from fcslam.live.robot import Robot
 
-_SCANS_PER_LINE = 600
-"""A line of progress is printed each time that many scans have come."""
 SERVER_PATIENCE_S = 60.0
 """Longest wait for the server at the end of a drive."""
-SWITCH_INTERVAL_S = 0.001
-"""Time after which a thread that publishes yields to the one that maps; Python's own is 5 ms."""
 
 
 @contextmanager
@@ -71,7 +67,7 @@ def drive_live(
 
     output = new_folder(RUNS) if output is None else output
     prepare_output(output, force=False)
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    sys.setswitchinterval(0.001)  # a thread that publishes yields to the one that maps; Python's own is 5 ms
     logging.getLogger("fcslam.live").addHandler(logging.NullHandler())  # its events are printed below
 
     def notify(line: str) -> None:
@@ -163,7 +159,7 @@ def pose_watch(
             return
         reported = scans
         follow(pose)
-        if scans % _SCANS_PER_LINE == 0:
+        if scans % 600 == 0:
             notify(f"{scans} scans")
 
     return watch

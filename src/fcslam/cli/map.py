@@ -183,7 +183,6 @@ def _without_collection() -> Iterator[None]:
 
 
 def _watch(display: "ProgressDisplay", total: int, faults: "dict[str, Faults]") -> "Callable[[Progress], None]":
-    """Show the mission's progress: ``total`` scans, then the fusion; ``faults`` receives the recordings' faults."""
     began = time.perf_counter()
 
     def watch(now: "Progress") -> None:
@@ -198,7 +197,6 @@ def _watch(display: "ProgressDisplay", total: int, faults: "dict[str, Faults]") 
 
 
 def _speed(recorded_s: float, elapsed_s: float) -> list[str]:
-    """The speed as a text; nothing if the recordings have no stamps that say how long they are."""
     if not recorded_s > 0.0 < elapsed_s:
         return []
     speed = recorded_s / elapsed_s
@@ -235,36 +233,29 @@ def _report(
         f"{values['intra_robot_closures_accepted']:.0f} closures within robots, "
         f"{values['inter_robot_closures_accepted']:.0f} between them",
     )
-    for line in _session_lines(run, earlier):
-        typer.echo(line)
+    lines = [*_session_lines(run, earlier)]
     for trajectory in run.trajectories.values():
         jumps = find_jumps(trajectory.stamps, trajectory.T_map_base)
-        if jumps is not None:
-            typer.echo(f"warning: {trajectory.robot}: {jumps}; check the map there")
+        lines += [f"warning: {trajectory.robot}: {jumps}; check the map there"] if jumps is not None else []
     maps, joined = int(values["maps"]), settings.fleet.join_maps
     if maps > 1:
-        typer.echo(f"{maps} maps" if joined else f"{maps} maps: one for each robot")
-    if joined:
-        _print_joins(run)
-        _print_separations(run)
-    for line in anchoring_lines(run.map_files):
-        typer.echo(line)
-    for name in sorted(name for name in run.map_files if name.endswith(".png")):
-        typer.echo(f"map: {output / name}")
+        lines.append(f"{maps} maps" if joined else f"{maps} maps: one for each robot")
+    lines += [*_join_lines(run), *_separation_lines(run)] if joined else []
+    lines += anchoring_lines(run.map_files)
+    lines += [f"map: {output / name}" for name in sorted(run.map_files) if name.endswith(".png")]
+    typer.echo("\n".join(lines))
 
 
-def _print_joins(run: "Run") -> None:
-    """Say on what evidence robots share a map; those from fewest places first."""
+def _join_lines(run: "Run") -> Iterator[str]:
     for join in sorted(run.joins, key=lambda join: join.places)[:MOST_JOINS]:
-        typer.echo(str(join))
+        yield str(join)
     if len(run.joins) > MOST_JOINS:
-        typer.echo(f"{len(run.joins) - MOST_JOINS} more joins, from more places: joins.csv")
+        yield f"{len(run.joins) - MOST_JOINS} more joins, from more places: joins.csv"
     if run.joins:
-        typer.echo("a LiDAR cannot tell exact copies of a wing or floor apart; --floor, --start and tags do")
+        yield "a LiDAR cannot tell exact copies of a wing or floor apart; --floor, --start and tags do"
 
 
 def _session_lines(run: "Run", earlier: "SavedMission") -> Iterator[str]:
-    """Say why each further session of a recording began."""
     from fcslam.cloud.sessions import robot_and_epoch
 
     before: dict[str, RobotTrajectory] = {}
@@ -288,13 +279,13 @@ def _session_lines(run: "Run", earlier: "SavedMission") -> Iterator[str]:
         yield f"{session.robot}: {why}; this session begins at {begin_s:.3f} s{remedy}"
 
 
-def _print_separations(run: "Run") -> None:
-    """Say for every two maps what keeps them apart; maps without similar places share one line."""
+def _separation_lines(run: "Run") -> Iterator[str]:
+    """For every two maps, what keeps them apart; maps without similar places share one line."""
     from fcslam.runs import separations
 
     apart = separations(run)
     unlike = [separation for separation in apart if separation.reason is None]
     for separation in apart if len(unlike) == 1 else (one for one in apart if one not in unlike):
-        typer.echo(str(separation))
+        yield str(separation)
     if len(unlike) > 1:
-        typer.echo(f"{len(unlike)} pairs of maps: no two of their places look alike")
+        yield f"{len(unlike)} pairs of maps: no two of their places look alike"

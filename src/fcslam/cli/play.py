@@ -23,10 +23,10 @@ from fcslam.cli.options import (
     access,
     mission_config,
 )
-from fcslam.cli.output import notices, print_line
+from fcslam.cli.output import notices, once_printer, print_line
 from fcslam.cli.training_options import Learn, learning_plan
 from fcslam.cli.warm_up import compiled, copied_process
-from fcslam.errors import InputError, PacketError, SourceError
+from fcslam.errors import InputError, PacketError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -55,11 +55,9 @@ def play(
         bool, typer.Option("--resume", help="Continue an interrupted recording instead of starting it again.")
     ] = False,
     speed: Annotated[
-        str,
-        typer.Option(
-            metavar="FACTOR", help="Playback speed as a multiple of real time; max plays as fast as possible."
-        ),
-    ] = "max",
+        float | None,
+        typer.Option(min=0.01, help="Playback speed as a multiple of real time.", show_default="as fast as possible"),
+    ] = None,
     floor: Floor = "",
     config: ConfigFiles = None,
     sensors: Sensors = None,
@@ -68,6 +66,7 @@ def play(
 ) -> None:
     """Map a recording, and send its places and keyscans to the cloud, through outages and restarts."""
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.cloud.sessions import check_robot
     from fcslam.live.playback import PlaybackPace
     from fcslam.live.playback import play as play_records
     from fcslam.live.records import Playback, Wiring
@@ -81,10 +80,13 @@ def play(
     settings, cloud = mission_config(config), access(server, credentials, budget_kBps)
     if cloud is None:
         raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")
-    pace = PlaybackPace(_speed(speed), time.monotonic, time.sleep)
+    pace = PlaybackPace(speed, time.monotonic, time.sleep)
     console = notices(quiet)
     opened, survey = open_recording(recording, sensors, console)
-    _check_name(opened.name)
+    try:
+        check_robot(opened.name)
+    except PacketError as error:
+        raise InputError(f"{error}; give another one: NAME=LOG") from error
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
     fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kBps, floor)
     with copied_process(settings.robot) as worker:
@@ -117,7 +119,6 @@ def _learn(
     watch: "Callable[[RobotStatus], None]",
     robot: "Robot",
 ) -> None:
-    """Stay after the drive and learn with the fleet, until the budget is spent or Ctrl-C ends it."""
     from fcslam.learning.federated.learning_process import LearningProcess
 
     def notify(line: str) -> None:
@@ -139,28 +140,6 @@ def _learn(
         learning.close()
 
 
-def _speed(text: str) -> float | None:
-    """Playback speed as a multiple of real time; None: as fast as possible."""
-    if text == "max":
-        return None
-    try:
-        speed = float(text)
-    except ValueError:
-        speed = 0.0
-    if not 0.0 < speed < float("inf"):
-        raise InputError(f"--speed {text!r} is not a speed; give a factor above 0, or max")
-    return speed
-
-
-def _check_name(name: str) -> None:
-    from fcslam.cloud.sessions import check_robot
-
-    try:
-        check_robot(name)
-    except PacketError as error:
-        raise SourceError(f"{error}; give another one: NAME=LOG") from error
-
-
 def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kBps: float | None, floor: str) -> str:
     """A digest of the inputs that determine the packets; digests of the packets themselves reveal other changes."""
     import hashlib
@@ -176,19 +155,16 @@ def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kB
 def robot_watch(display: "ProgressDisplay", console: "Console", total: int) -> "Callable[[RobotStatus], None]":
     """Show the progress of ``total`` scans, and print each change of the connection and of the robot's localization."""
     before: RobotStatus | None = None
-    waits = sends = False
+    sends, print_once = False, once_printer(console)
 
     def watch(now: "RobotStatus") -> None:
-        nonlocal before, waits, sends
+        nonlocal before, sends
         for line in _news(now, before):
             print_line(console, line)
         before, is_complete = now, now.scans == total
-        if is_complete and now.trouble and not waits:
-            waits = True
-            print_line(
-                console,
-                f"all scans are mapped; {now.waiting.packets} packets wait for the server. Ctrl-C ends the wait: they "
-                "stay on disk, and --resume sends them",
+        if is_complete and now.trouble:
+            print_once(
+                "all scans are mapped, and packets wait for the server. Ctrl-C ends the wait: --resume sends them"
             )
         details = _details(now, is_complete)
         display.show("mapping", now.scans, total, details)

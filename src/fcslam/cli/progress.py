@@ -3,27 +3,26 @@
 from collections.abc import Callable
 from threading import Event, Thread
 from time import monotonic
-from typing import Final, Self
+from typing import Self
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Column
-from rich.text import Text
 
 from fcslam.cli.output import print_line
 
-INTERVAL_S: Final = 5.0
-"""Time between two plain lines. It grows to a twentieth of the elapsed time, so that logs of long runs stay short."""
-LONGEST_INTERVAL_S: Final = 60.0
-SPEED_PERIOD_S: Final = 3600.0
-"""Remaining times follow the speed over this period: a round of training may take many minutes."""
-BAR_WIDTH: Final = 16
-LONGEST_STAGE: Final = 20
-"""Widths in characters that leave room for count, remaining time and some details at 80 columns."""
-
 
 class ProgressDisplay:
-    """The stages of a command, with count and remaining time each.
+    """The stages of a command, with count, elapsed and remaining time each.
 
     The display starts with the first stage, so a command may refuse bad input or start processes before. Its methods
     may be called from any thread.
@@ -31,25 +30,29 @@ class ProgressDisplay:
     Args:
         console: where to show progress; nothing is shown if it is quiet.
         heading: a line to print when the first stage starts.
-        interval_s: time between two plain lines at first, in seconds.
+        interval_s: time between two plain lines at first, in seconds. It grows to a twentieth of the elapsed time and
+            at most a minute, so that logs of long runs stay short.
     """
 
-    def __init__(self, console: Console, heading: str = "", interval_s: float = INTERVAL_S) -> None:
+    def __init__(self, console: Console, heading: str = "", interval_s: float = 5.0) -> None:
         self._console = console
         self._heading = heading
         self._interval_s = interval_s
         self._is_live = console.is_terminal and not console.is_dumb_terminal and not console.quiet
+        self._count, self._elapsed, self._left = MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+        whole, cut = Column(no_wrap=True, overflow="ellipsis", max_width=20), Column(no_wrap=True, ratio=1)
         self._bars = Progress(
-            _text("{task.description}", max_width=LONGEST_STAGE),
-            BarColumn(bar_width=BAR_WIDTH),
-            _TextOf(_count),
-            _TextOf(_time),
-            _text("{task.fields[details]}", ratio=1),
+            TextColumn("{task.description}", markup=False, table_column=whole),
+            BarColumn(bar_width=16),  # leaves room for some details at 80 columns
+            self._count,
+            self._elapsed,
+            self._left,
+            TextColumn("{task.fields[details]}", markup=False, table_column=cut),
             console=console,
             transient=True,
             expand=True,
             disable=not self._is_live,
-            speed_estimate_period=SPEED_PERIOD_S,
+            speed_estimate_period=3600.0,  # a round of training may take many minutes
         )
         self._tasks: dict[str, TaskID] = {}
         self._printer: Thread | None = None
@@ -102,50 +105,13 @@ class ProgressDisplay:
         began = monotonic()
         interval_s = self._interval_s
         while not self._ended.wait(interval_s):
-            line = "; ".join(_line(task) for task in self._bars.tasks if task.visible and not task.finished)
+            line = "; ".join(self._line(task) for task in self._bars.tasks if task.visible and not task.finished)
             if line:
                 print_line(self._console, line)
-            interval_s = max(self._interval_s, min((monotonic() - began) / 20.0, LONGEST_INTERVAL_S))
+            interval_s = max(self._interval_s, min((monotonic() - began) / 20.0, 60.0))
 
-
-def _text(text: str, max_width: int | None = None, ratio: int | None = None) -> TextColumn:
-    column = Column(no_wrap=True, overflow="ellipsis", max_width=max_width, ratio=ratio)
-    return TextColumn(text, markup=False, table_column=column)
-
-
-class _TextOf(ProgressColumn):
-    """A column with a text that a function makes of the task."""
-
-    max_refresh = 0.5
-
-    def __init__(self, text: Callable[[Task], str]) -> None:
-        super().__init__(Column(no_wrap=True))
-        self._text = text
-
-    def render(self, task: Task) -> Text:
-        return Text(self._text(task))
-
-
-def _count(task: Task) -> str:
-    if task.total is None:
-        return f"{task.completed:.0f}" if task.completed else ""
-    return f"{task.completed:.0f}/{task.total:.0f}"
-
-
-def _time(task: Task) -> str:
-    """Remaining time if it is known, else elapsed time."""
-    if task.total is None or task.finished:
-        return _clock(task.finished_time if task.finished else task.elapsed)
-    return f"{_clock(task.time_remaining)} left"
-
-
-def _clock(seconds: float | None) -> str:
-    if seconds is None:
-        return "-:--:--"
-    minutes, rest = divmod(int(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
-
-
-def _line(task: Task) -> str:
-    stage = " ".join(filter(None, (task.description, _count(task))))
-    return ", ".join(filter(None, (stage, _time(task), task.fields["details"])))
+    def _line(self, task: Task) -> str:
+        left = self._left.render(task).plain
+        stage = f"{task.description} {self._count.render(task).plain.strip()}"
+        told = stage, self._elapsed.render(task).plain, f"{left} left" if left else "", task.fields["details"]
+        return ", ".join(filter(None, told))

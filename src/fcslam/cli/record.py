@@ -1,7 +1,7 @@
 """`fcslam record`: write the sensors of a live robot, or of another recording, into a file."""
 
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from fcslam.cli.inputs import LiveSource
     from fcslam.records import SensorRecord
-    from fcslam.sources import Source
 
 
 def record(
@@ -87,19 +86,35 @@ def _record(live: "LiveSource", output: Path, duration: float | None, force: boo
 
 
 def _convert(log: str, output: Path, sensors: list[str] | None, force: bool, console: "Console") -> None:
+    from fcslam.cli.progress import ProgressDisplay
+    from fcslam.records import LaserScan
+    from fcslam.sources import write_bag
+
     _prepare(output, force)
     source, survey = open_recording(log, sensors, console)
-    _write(output, _with_progress(source, survey.scan_count, console))
+
+    def records() -> "Iterator[SensorRecord]":
+        advance = display.start("converting", survey.scan_count)
+        for record in source.records():
+            yield record
+            if isinstance(record, LaserScan):
+                advance()
+
+    try:
+        with ProgressDisplay(console) as display, TemporaryDirectory(prefix=".", dir=output.parent) as staging:
+            whole = Path(staging, output.name)
+            write_bag(whole, records())
+            if output.is_dir():
+                shutil.rmtree(output)
+            whole.replace(output)
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written ({error}); choose another place") from error
     print_faults(console, {source.name: source.faults})
     typer.echo(f"{survey.scan_count} scans: {output}")
 
 
 def _prepare(output: Path, force: bool) -> None:
     """Check before the work that ``output`` can be written, and create its parents."""
-    from fcslam.sources import BAG_SUFFIXES
-
-    if output.suffix not in BAG_SUFFIXES:
-        raise InputError(f"{output}: unknown format; give .mcap, .db3, .bag, or no suffix for a folder")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         if output.exists() and not force:
@@ -108,30 +123,3 @@ def _prepare(output: Path, force: bool) -> None:
             raise InputError(f"{output}: is a folder, not a recording; choose another name")
     except OSError as error:
         raise InputError(f"{output}: cannot be written ({error}); choose another place") from error
-
-
-def _write(output: Path, records: "Iterable[SensorRecord]") -> None:
-    """Write into a temporary folder beside ``output`` and move the complete bag to its place."""
-    from fcslam.sources import write_bag
-
-    try:
-        with TemporaryDirectory(prefix=".", dir=output.parent) as staging:
-            whole = Path(staging, output.name)
-            write_bag(whole, records)
-            if output.is_dir():
-                shutil.rmtree(output)
-            whole.replace(output)
-    except OSError as error:
-        raise InputError(f"{output}: cannot be written ({error}); choose another place") from error
-
-
-def _with_progress(source: "Source", total: int, console: "Console") -> "Iterator[SensorRecord]":
-    from fcslam.cli.progress import ProgressDisplay
-    from fcslam.records import LaserScan
-
-    with ProgressDisplay(console) as display:
-        advance = display.start("converting", total)
-        for record in source.records():
-            yield record
-            if isinstance(record, LaserScan):
-                advance()

@@ -8,14 +8,7 @@ import typer
 
 from fcslam.cli.options import SettingsFiles, chosen_settings, output_option
 from fcslam.cli.output import TRAINING, new_folder, notices, once_printer, print_line
-from fcslam.cli.training_options import (
-    QUICK_IMAGES,
-    TRAINING_OUTPUT,
-    Quick,
-    Start,
-    compute_budget,
-    require_training_libraries,
-)
+from fcslam.cli.training_options import TRAINING_OUTPUT, Start, compute_budget, require_training_libraries
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -25,10 +18,6 @@ if TYPE_CHECKING:
     from fcslam.learning.settings import TrainingSettings
     from fcslam.learning.stages import StageCallback
     from fcslam.learning.trainer import TrainingProgress
-
-QUICK = {"steps": 20, "pairs": 2, "side_px": 96, "label_copies": 2}
-"""Settings of ``--quick``: every stage runs, none long enough to learn much."""
-FIGURES = ("repeatability", "mma_3px")
 
 
 def train(
@@ -40,13 +29,12 @@ def train(
         Path | None, typer.Option(help="Folder with the keypoints of a teacher network, of tools/teacher_points.py.")
     ] = None,
     start: Start = None,
-    quick: Quick = False,
 ) -> None:
     """Train a detector of keypoints with 256-bit descriptors on images without labels."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.learning.settings import TrainingSettings
 
-    settings = chosen_settings(TrainingSettings().model_copy(update=QUICK if quick else {}), config)
+    settings = chosen_settings(TrainingSettings(), config)
     require_training_libraries()
     from fcslam.learning.artifacts import write_artifacts
     from fcslam.learning.stages import train_detector, training_report
@@ -55,17 +43,9 @@ def train(
     output = output or new_folder(TRAINING)
     began = time.perf_counter()
     with ProgressDisplay(console, f"output: {output}") as display:
-        watch, options = _watch(display, console), compute_budget(quick)
-        network, found = train_detector(
-            images,
-            output,
-            settings,
-            options,
-            teacher,
-            watch,
-            QUICK_IMAGES if quick else None,
-            None if teacher is not None and start is None else _start_network(start, output, settings, images),
-        )
+        watch, options = _watch(display, console), compute_budget()
+        begun = None if teacher is not None and start is None else _start_network(start, output, settings, images)
+        network, found = train_detector(images, output, settings, options, teacher, watch, start=begun)
     files = write_artifacts(network, output, "training.png", settings, training_report(output, found, teacher))
     for file in files:
         typer.echo(str(file))
@@ -86,11 +66,11 @@ def _start_network(
 
 
 def _watch(display: "ProgressDisplay", console: "Console") -> "StageCallback":
-    """Show each stage, and print its last figures and every alarm once."""
     print_once = once_printer(console)
 
     def watch(stage: str, status: "TrainingProgress") -> None:
-        figures = "  ".join(f"{name} {status.metrics[name]:.3f}" for name in FIGURES if name in status.metrics)
+        known = [name for name in ("repeatability", "mma_3px") if name in status.metrics]
+        figures = "  ".join(f"{name} {status.metrics[name]:.3f}" for name in known)
         display.show(stage, status.step, status.steps, figures)
         if figures and status.step == status.steps:
             print_once(f"{stage} {status.step}/{status.steps}  {figures}")

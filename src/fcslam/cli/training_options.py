@@ -24,8 +24,6 @@ Start = Annotated[
         show_default="the network that comes with fcslam",
     ),
 ]
-Quick = Annotated[bool, typer.Option("--quick", help="Train for about a minute, only to check that everything works.")]
-
 LEARNING_FILE = "learning.yaml"
 """Settings of learning, in a robot's state folder or a service's data folder; each key has a default."""
 
@@ -39,11 +37,6 @@ Learn = Annotated[
     ),
 ]
 
-QUICK_IMAGES = 4
-"""Images of a robot: labelling one takes vgg some seconds."""
-QUICK_VALIDATION_PAIRS = 2
-"""A validation of vgg on all pairs takes half a minute."""
-
 
 def require_training_libraries(*others: str, extra: str = "train") -> None:
     """Raise InputError if a library that training needs, or one of ``others``, is missing."""
@@ -52,8 +45,8 @@ def require_training_libraries(*others: str, extra: str = "train") -> None:
         raise InputError(f"training needs {', '.join(missing)}; install it with: pip install 'fcslam[{extra}]'")
 
 
-def compute_budget(quick: bool = False) -> "ExecutionOptions":
-    """How to train here: on a GPU if CUDA shows one, the threads, and how often to validate and log."""
+def compute_budget() -> "ExecutionOptions":
+    """How to train here: on a GPU if CUDA shows one, and the threads."""
     import torch
 
     from fcslam.learning.trainer import ExecutionOptions
@@ -66,10 +59,6 @@ def compute_budget(quick: bool = False) -> "ExecutionOptions":
             f"the GPU that CUDA names cannot be used ({error}); set CUDA_VISIBLE_DEVICES to nothing to train without"
         ) from error
     threads = 1 if device == "cpu" else max((os.cpu_count() or 2) - 1, 1)
-    if quick:
-        return ExecutionOptions(
-            device=device, threads=threads, validate_every=20, validation_pairs=QUICK_VALIDATION_PAIRS, log_every=20
-        )
     return ExecutionOptions(device=device, threads=threads)
 
 
