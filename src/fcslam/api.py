@@ -135,10 +135,8 @@ def localize(
         map: a run folder or mission file; the YAML file of a ROS map; or a map.
         initial_pose: about where the recording starts in the map, (x, y, theta), metres and radians; None: anywhere.
         config: as for ``map_recordings``; ``robot`` counts.
-        output: run folder to write; by default nothing is written.
-        bag_options: topics and the pose of the laser, where a ROS bag leaves a choice.
+        output, bag_options, force: as for ``map_recordings``.
         progress: called every 50 scans.
-        force: replace a run that is at ``output``.
         floor: floor of the recording, whose first map is used; it must be named if the run has maps of several floors.
         update: draw what changed since into the map of the run, where at least ``map.contradicting_scans`` scans show
             it. The map before is beside it, as ``map_before``; poses and unchanged cells stay.
@@ -146,9 +144,6 @@ def localize(
     Returns:
         A run whose trajectory holds the poses that the robot believed; ``localized`` has every scan with standard
             deviations and quality.
-
-    Raises:
-        InputError: the recording, the map, the initial pose, the configuration or the output folder cannot be used.
     """
     from fcslam.mission.localization import (  # SciPy's images: mapping alone needs none
         pose_in_map,
@@ -189,9 +184,6 @@ def changes(
         map_index: number of the map in the run folder.
         output: folder to write; by default nothing is written.
         force: replace changes that are at ``output``.
-
-    Raises:
-        InputError: the run, a time or the output folder cannot be used.
     """
     from fcslam.mission.map_changes import check_output, find_changes, save_changes
 

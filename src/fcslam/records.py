@@ -349,18 +349,14 @@ class TagSighting:
 
 @dataclass(frozen=True, slots=True)
 class KeyscanFix:
-    """A position by satellites near a keyscan."""
+    """A position by satellites near a keyscan; numbers as in ``GnssFix``, the antenna in the keyscan's base."""
 
     id: KeyscanId
     latitude_deg: float
-    """On the ellipsoid WGS 84."""
     longitude_deg: float
     altitude_m: float
-    """Above the ellipsoid; 0 if unknown."""
     sigma_m: float
-    """Standard deviation, east and north each."""
     antenna_xy: tuple[float, float]
-    """Position of the antenna in the keyscan's base, metres."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,35 +63,25 @@ _ROUND = 60
 _STEPS = 30
 
 
-def warm_up_scanning() -> None:
-    """Compile what the first scan of a robot needs: points, normals and the field."""
+def warm_up_scans() -> None:
+    """Compile what the first scans of a robot need: points, normals, the field, matching, and the search.
+
+    Scans without points compile the same code.
+    """
     scan = next(made_up_scans(1))
     field_of([(point_scan(scan.ranges_m, scan.laser, Sweep(0.0, 0.1)), np.zeros(3))])
-
-
-def warm_up_matching() -> None:
-    """Compile what the second scan needs. Arrays without content: nothing else is compiled for them."""
     match_scan(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3), np.zeros((3, 3)))
-
-
-def warm_up_searching() -> None:
-    """Compile the search of doubtful scans, and packets of keyscans."""
     search(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3), SearchWindow(0.5, 0.1))
     warm_up_decoding()
 
 
 def warm_up_robot() -> None:
-    """Compile submaps, their description, loop closing, and packets of places."""
+    """Compile submaps and their description, loop closing, packets of places, the vocabulary, and its comparisons."""
     robot = RobotFrontend("r", RobotConfig(channels=(Channel.LIDAR,)))
     for scan in made_up_scans(2 * _ROUND):
         for packet in robot.process(scan):
             measure(packet)
-
-
-def warm_up_recognition() -> None:
-    """Compile the vocabulary, and what compares places."""
-    vocabulary = VocabularyConfig(train_batch=2, leaf_capacity=32)
-    places = OwnPlaces(vocabulary)
+    places = OwnPlaces(VocabularyConfig(train_batch=2, leaf_capacity=32))
     surface = build_submap([(point_scan(s.ranges_m, s.laser), s.T_odom_base) for s in made_up_scans(9)]).surface.points
     for k in range(4):
         places.store(k, surface)
@@ -132,14 +122,7 @@ def warm_up_fleet() -> None:
     run_of(result, tracks, (), "", OccupancyConfig(), with_local_maps=False, with_certificates=False)
 
 
-WARM_UPS: Final = (
-    warm_up_scanning,
-    warm_up_matching,
-    warm_up_searching,
-    warm_up_robot,
-    warm_up_recognition,
-    warm_up_fleet,
-)
+WARM_UPS: Final = (warm_up_scans, warm_up_robot, warm_up_fleet)
 """In the order in which a mission needs them."""
 
 
@@ -150,14 +133,13 @@ def is_cold() -> bool:
 
 @contextmanager
 def compiling(processes: int) -> Iterator[Sequence[Background]]:
-    """Run the warm-ups of the first two scans, then the others beside this block, in copies of this process.
+    """Run the warm-up of the first scans, then the others beside this block, in copies of this process.
 
     The copies fill the cache and end with the context. Without a cache, or with one process, this process compiles the
     rest when it needs it.
     """
-    scanning, matching, *others = WARM_UPS
-    scanning()
-    matching()
+    first, *others = WARM_UPS
+    first()
     count = 0 if uncached() else min(processes - 1, len(others))
     copies = [start_copy(partial(_compile, others[k::count]), niceness=0) for k in range(count)]
     try:

@@ -7,7 +7,7 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
@@ -15,7 +15,7 @@ from urllib.parse import parse_qsl, unquote, urlencode, urlsplit, urlunsplit
 
 from fcslam.config import one_line
 from fcslam.errors import StoreError
-from fcslam.storage.row_store import Result, StoreTable
+from fcslam.storage.row_store import StoreTable
 
 if TYPE_CHECKING:
     import psycopg
@@ -45,9 +45,6 @@ class Postgres:
         Args:
             url: postgresql://USER@HOST:PORT/DATABASE without a password (``take_password``).
             name: of this process, for those who look at the server.
-
-        Raises:
-            StoreError: there is no driver, or the server cannot be used.
         """
         self.url = _checked(url)
         self._name = name
@@ -71,7 +68,7 @@ class Postgres:
             begin: a statement that is executed first. If the connection turns out to be lost, another one is made.
         """
         with self._places, self._translated():
-            connection = self._retried(lambda connection: (connection, connection.execute(begin))[0])
+            connection = self._begun(begin)
             try:
                 yield connection
             finally:
@@ -80,19 +77,12 @@ class Postgres:
     def rows(
         self, statement: str, values: Sequence[object] | Mapping[str, object] = (), schema: str = "fcslam"
     ) -> list[tuple[Any, ...]]:
-        """All rows that a query of a schema finds. If the connection turns out to be lost, it asks again."""
-
-        def ask(connection: "_Connection") -> tuple["_Connection", list[tuple[Any, ...]]]:
-            connection.execute(f"SET search_path TO {schema}".encode())
-            return connection, PostgresTransaction(connection).execute(statement, values).fetchall()
-
-        with self._places, self._translated():
-            connection, found = self._retried(ask)
-            self._give_back(connection)
+        """All rows that a query of a schema finds."""
+        with self.connection(f"SET search_path TO {schema}") as connection:
+            found: list[tuple[Any, ...]] = PostgresTransaction(connection).execute(statement, values).fetchall()
         return found
 
-    def _retried(self, work: Callable[["_Connection"], Result]) -> Result:
-        """Do with a connection what changes nothing; with another one if it is lost."""
+    def _begun(self, begin: str) -> "_Connection":
         import psycopg
 
         until = time.monotonic() + RETRY_S
@@ -100,7 +90,8 @@ class Postgres:
             connection = None
             try:
                 connection = self._idle.pop() if self._idle else self._connected()
-                return work(connection)
+                connection.execute(begin.encode())
+                return connection
             except BaseException as error:
                 if connection is not None:
                     self._give_back(connection)
