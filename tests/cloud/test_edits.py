@@ -139,7 +139,13 @@ def test_a_removal_survives_in_the_state_of_a_fleet(scripted, tmp_path):
     fleet.edit([Removal("b"), Veto("a", "c", (1.0, 2.0))])
     write_state(tmp_path / "state", "test", fleet.state())
     stored = {PacketNumber(packet.robot, packet.sequence): packet for packet in with_liar()}
-    again = Fleet.restored(FleetConfig(), 0, read_state(tmp_path / "state", "test"), stored.__getitem__)
+    again = Fleet.restored(
+        FleetConfig(),
+        0,
+        read_state(tmp_path / "state", "test"),
+        stored.__getitem__,
+        changes=[Removal("b"), Veto("a", "c", (1.0, 2.0))],
+    )
     assert fingerprint(again.estimate()) == fingerprint(fleet.estimate())
     with pytest.raises(ValueError, match="come back"):
         again.edit([Veto("a", "c", (1.0, 2.0))])
@@ -346,10 +352,13 @@ def test_a_region_moves_with_the_keyscan_to_which_it_is_tied(scripted):
 
 def test_edits_survive_in_the_state_of_a_fleet(scripted, tmp_path):
     fleet = feed(scripted(closures(A, B, PAIRS[:1])), TWO).fleet
-    fleet.edit([Pin("a", "b", (0.0, 1000.0)), ManualClosure("a", 9.0, "b", 1009.0, (0.0, 0.0, 0.0), (0.1, 0.1))])
+    changes = [Pin("a", "b", (0.0, 1000.0)), ManualClosure("a", 9.0, "b", 1009.0, (0.0, 0.0, 0.0), (0.1, 0.1))]
+    fleet.edit(changes)
     write_state(tmp_path / "state", "test", fleet.state())
     stored = {PacketNumber(packet.robot, packet.sequence): packet for packet in TWO}
-    again = Fleet.restored(FleetConfig(), 0, read_state(tmp_path / "state", "test"), stored.__getitem__)
+    again = Fleet.restored(
+        FleetConfig(), 0, read_state(tmp_path / "state", "test"), stored.__getitem__, changes=changes
+    )
     assert fingerprint(again.estimate()) == fingerprint(fleet.estimate())
     assert fingerprint(again.conclude()) == fingerprint(fleet.conclude())
     again.edit([])

@@ -46,11 +46,11 @@ def go_on(fleet, packets):
     return fleet
 
 
-def restarted(fleet, packets, path):
+def restarted(fleet, packets, path, changes=()):
     """The fleet by way of a file."""
     write_state(path, "test", fleet.state())
     stored = {PacketNumber(in_session(packet).robot, packet.sequence): packet for packet in packets}
-    return Fleet.restored(CONFIG, 0, read_state(path, "test"), stored.__getitem__)
+    return Fleet.restored(CONFIG, 0, read_state(path, "test"), stored.__getitem__, changes=changes)
 
 
 def believed(fleet):
@@ -76,8 +76,9 @@ def test_restarts_anywhere_change_nothing(packets, uninterrupted, tmp_path):
 
 def test_a_veto_and_decisions_survive(packets, tmp_path):
     fleet = go_on(Fleet(CONFIG, 0), packets)
-    fleet.edit([Veto(packets[0].robot, next(p.robot for p in packets if p.robot != packets[0].robot))])
-    same(restarted(fleet, packets, tmp_path / "state"), fleet)
+    veto = Veto(packets[0].robot, next(p.robot for p in packets if p.robot != packets[0].robot))
+    fleet.edit([veto])
+    same(restarted(fleet, packets, tmp_path / "state", [veto]), fleet)
 
 
 def test_a_log_survives_with_its_gaps_and_refusals(tmp_path):

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from typing import ClassVar
 
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
@@ -17,7 +18,7 @@ from fcslam.records import (
     Tag,
     frozen,
 )
-from fcslam.storage.snapshot import from_state, to_state
+from fcslam.storage.snapshot import Kept
 from fcslam.storage.state_file import State
 
 MATCHER = "fleet.matcher"
@@ -58,8 +59,10 @@ class ClosureEntry:
         self.closure = replace(self.closure, status=status, reason=reason)
 
 
-class ClosureLog:
+class ClosureLog(Kept):
     """Closures in the order in which they were found."""
+
+    KEPT: ClassVar = {"_entries": list[ClosureEntry]}
 
     def __init__(self) -> None:
         self._entries: list[ClosureEntry] = []
@@ -117,23 +120,23 @@ class ClosureLog:
 
     def _add(self, entry: ClosureEntry) -> ClosureEntry:
         self._entries.append(entry)
+        self._index(entry)
+        return entry
+
+    def _index(self, entry: ClosureEntry) -> None:
         if not entry.is_between:
-            return entry
+            return
         i, j = entry.closure.i, entry.closure.j
         self._between.setdefault(frozenset((i.robot, j.robot)), []).append(entry)
         if entry.closure.status is not ClosureStatus.CANDIDATE:
             for place in (i, j):
                 self._at.setdefault(place.robot, {}).setdefault(place.number, []).append(entry)
-        return entry
-
-    def state(self) -> State:
-        """The state that ``restore`` needs."""
-        return {"entries": to_state(self._entries)}
 
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
-        for entry in from_state(list[ClosureEntry], state["entries"]):
-            self._add(entry)
+        super().restore(state)
+        for entry in self._entries:
+            self._index(entry)
 
     def evidence(self, a: str, b: str) -> list[ClosureEntry]:
         """The verified closures between two robots that the joint map did not predict and no veto excludes."""

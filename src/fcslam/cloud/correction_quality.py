@@ -1,7 +1,7 @@
 """How well other sessions support the pose of a session in its map: ``Correction.quality``."""
 
 from collections.abc import Collection, Iterable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -9,8 +9,7 @@ from fcslam.cloud.closure_log import ClosureLog
 from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD, JointGraph
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import KeyscanId, Place
-from fcslam.storage.snapshot import from_state, to_state
-from fcslam.storage.state_file import State
+from fcslam.storage.snapshot import Kept
 
 FRESH_M = 4.0
 """Travel, in metres, within which a comparison counts in full; the next place is about 2 m away."""
@@ -33,8 +32,10 @@ class _Comparison(NamedTuple):
     """Share of the surface seen by both sessions that agrees, in [0, 1]; less if a match differs or is not verified."""
 
 
-class CorrectionQuality:
+class CorrectionQuality(Kept):
     """Keeps the newest comparison of every session with another session of its map."""
+
+    KEPT: ClassVar = {"_newest": dict[str, _Comparison]}
 
     def __init__(self, graph: JointGraph) -> None:
         self._graph = graph
@@ -52,14 +53,6 @@ class CorrectionQuality:
             newest = self._newest.get(session)
             if newest is None or newest.last <= last:
                 self._newest[session] = _Comparison(last, self._share(found))
-
-    def state(self) -> State:
-        """The state that ``restore`` takes."""
-        return {"newest": to_state(self._newest)}
-
-    def restore(self, state: State) -> None:
-        """Take over a ``state``."""
-        self._newest = from_state(dict[str, _Comparison], state["newest"])
 
     def of(self, session: str, robots: Collection[str], closures: ClosureLog) -> float:
         """In [0, 1], as in ``Correction``; ``robots`` share the session's map."""

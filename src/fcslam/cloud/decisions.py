@@ -6,11 +6,12 @@
 from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import combinations
+from typing import ClassVar
 
 import numpy as np
 
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
-from fcslam.cloud.edits import edit_json, is_cut, is_removed, kind_of, read_edit, stamps_of
+from fcslam.cloud.edits import is_cut, is_removed, stamps_of
 from fcslam.cloud.joining import CONSISTENCY, decide_join
 from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD, JointGraph
 from fcslam.cloud.manual_closures import Scans, measured
@@ -35,11 +36,9 @@ from fcslam.records import (
     Reason,
     ReasonCode,
     Tag,
-    Undo,
     Veto,
 )
-from fcslam.storage.snapshot import from_state, to_state
-from fcslam.storage.state_file import State
+from fcslam.storage.snapshot import Kept
 
 CONTESTED_GROWTH = 1.1
 """After a re-evaluation confirmed a contested join, the number of closures grows by this factor before the next one:
@@ -54,14 +53,26 @@ DECIDED_EACH_TIME = 100
 """Up to this many closures, two sessions are decided at each new one."""
 
 
-class ClosureDecisions:
-    """Accepts closures, joins maps, applies edits and re-evaluates all of it when evidence turns."""
+class ClosureDecisions(Kept):
+    """Accepts closures, joins maps, applies edits and re-evaluates all of it when evidence turns.
+
+    Its state is without the closures, the comparisons of maps and the changes by hand.
+    """
+
+    KEPT: ClassVar = {
+        "_due": dict[frozenset[str], int],
+        "maps": list[list[str]],
+        "joins": dict[frozenset[str], ClusterEvidence],
+        "version": int,
+        "_contested": bool,
+        "_postponed_until": int,
+    }
 
     def __init__(self, config: FleetConfig, sessions: SessionStore, graph: JointGraph) -> None:
         self._config = config
         self._sessions = sessions
         self._graph = graph
-        self._comparison = MapComparison(sessions)
+        self.comparison = MapComparison(sessions)
         self._due: dict[frozenset[str], int] = {}
         """Number of closures between two sessions from which on they are decided again."""
         self.closures = ClosureLog()
@@ -73,16 +84,12 @@ class ClosureDecisions:
         """Groups of sessions that shared a map until a re-evaluation, and whose places are to be compared again."""
         self.version = 0
         """How often the joint graph was solved."""
-        self._changes: tuple[Change, ...] = ()
+        self.changes: tuple[Change, ...] = ()
+        """The changes by hand that are in force."""
         self._contested = False
         """Whether evidence has turned against a join."""
         self._postponed_until = 0
         """Number of closures below which a contested join is not re-evaluated."""
-
-    @property
-    def changes(self) -> tuple[Change, ...]:
-        """The changes by hand that are in force."""
-        return self._changes
 
     def map_of(self, session: str) -> list[str]:
         """The sessions that share a map with this one, itself included."""
@@ -132,7 +139,7 @@ class ClosureDecisions:
 
         Returns whether a decision changed.
         """
-        self._changes = tuple(changes)
+        self.changes = tuple(changes)
         turned = [entry for entry in self.closures if self._mark(entry)]
         decided = any(entry.pinned or entry.closure.status is not ClosureStatus.CANDIDATE for entry in turned)
         if decided or self._missing(final=False):
@@ -153,8 +160,8 @@ class ClosureDecisions:
             self._graph,
             self.closures,
             self._config.consistency,
-            partial(self._comparison.fit, growth=1.0) if final else self._comparison.fit,
-            self._comparison.at,
+            partial(self.comparison.fit, growth=1.0) if final else self.comparison.fit,
+            self.comparison.at,
         )
         self.separated += _separated(self.maps, fusion.maps)
         self.maps, self.joins = [list(sessions) for sessions in fusion.maps], dict(fusion.joins)
@@ -163,31 +170,6 @@ class ClosureDecisions:
         self.version += 1
         return fusion
 
-    def state(self) -> State:
-        """The state that ``restore`` needs."""
-        return {
-            "closures": self.closures.state(),
-            "due": to_state(self._due),
-            "comparison": self._comparison.state(),
-            "maps": self.maps,
-            "joins": to_state(self.joins),
-            "version": self.version,
-            "changes": [(kind_of(change), edit_json(change)) for change in self._changes],
-            "contested": self._contested,
-            "postponed_until": self._postponed_until,
-        }
-
-    def restore(self, state: State) -> None:
-        """Take over a ``state``."""
-        self.closures.restore(state["closures"])
-        self._due = from_state(dict[frozenset[str], int], state["due"])
-        self._comparison.restore(state["comparison"])
-        self.maps, self.version = state["maps"], state["version"]
-        self.joins = from_state(dict[frozenset[str], ClusterEvidence], state["joins"])
-        changes = (read_edit(*change) for change in state["changes"])
-        self._changes = tuple(change for change in changes if not isinstance(change, Undo))
-        self._contested, self._postponed_until = state["contested"], state["postponed_until"]
-
     def _mark(self, entry: ClosureEntry) -> bool:
         """Note whether users exclude or pin the closure; returns whether that is new."""
         before = entry.vetoed, entry.pinned
@@ -195,19 +177,19 @@ class ClosureDecisions:
         return before != (entry.vetoed, entry.pinned)
 
     def _is_vetoed(self, entry: ClosureEntry) -> bool:
-        if entry.made_by_hand is not None and entry.made_by_hand not in self._changes:
+        if entry.made_by_hand is not None and entry.made_by_hand not in self.changes:
             return True
         i, j = ((end.robot, self._sessions.stamp(end)) for end in (entry.closure.i, entry.closure.j))
         return (
-            is_removed(i[0], self._changes)
-            or is_removed(j[0], self._changes)
-            or any(change.forbids(*i, *j) for change in self._changes if isinstance(change, Veto))
+            is_removed(i[0], self.changes)
+            or is_removed(j[0], self.changes)
+            or any(change.forbids(*i, *j) for change in self.changes if isinstance(change, Veto))
             or self._is_cut(entry)
         )
 
     def _is_cut(self, entry: ClosureEntry) -> bool:
         """Whether users cut a scan behind the closure: of the submaps that were compared, or else of its two ends."""
-        cuts = [change for change in self._changes if isinstance(change, Cut)]
+        cuts = [change for change in self.changes if isinstance(change, Cut)]
         if not cuts:
             return False
         is_of_places = entry.is_between and entry.made_by_hand is None
@@ -220,7 +202,7 @@ class ClosureDecisions:
 
     def _is_pinned(self, entry: ClosureEntry) -> bool:
         i, j = entry.closure.i, entry.closure.j
-        pins = [change for change in self._changes if isinstance(change, Pin)]
+        pins = [change for change in self.changes if isinstance(change, Pin)]
         return entry.made_by_hand is not None or any(
             pin.confirms(i.robot, self._sessions.stamp(i), j.robot, self._sessions.stamp(j)) for pin in pins
         )
@@ -230,7 +212,7 @@ class ClosureDecisions:
 
         Unless this is ``final``, a later keyscan may be nearer than the newest one of a session.
         """
-        made = [change for change in self._changes if isinstance(change, ManualClosure)]
+        made = [change for change in self.changes if isinstance(change, ManualClosure)]
         entered = {entry.made_by_hand for entry in self.closures} if made else set()
         present = set(self._sessions.robots)
         return [
@@ -238,7 +220,7 @@ class ClosureDecisions:
             for change in made
             if change not in entered
             and {change.robot_i, change.robot_j} <= present
-            and not any(is_removed(session, self._changes) for session in (change.robot_i, change.robot_j))
+            and not any(is_removed(session, self.changes) for session in (change.robot_i, change.robot_j))
             and self._sessions.floor(change.robot_i) == self._sessions.floor(change.robot_j)
             and len(set(self._ends(change))) == 2
             and (final or all(self._has_passed(session, stamp) for session, stamp in stamps_of(change)))
@@ -277,7 +259,7 @@ class ClosureDecisions:
         entries, pair = self.closures.evidence(a, b), frozenset((a, b))
         if len(entries) < self._due.get(pair, 0):
             return
-        decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self._comparison.fit)
+        decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self.comparison.fit)
         if b in self.map_of(a):
             self._contested |= self._is_contested(decision, entries)
         if decision.shortfall is not None:
@@ -303,10 +285,10 @@ class ClosureDecisions:
     def _is_refuted(self, pair: frozenset[str]) -> bool:
         """Whether the maps of two joined sessions have grown since they were compared, and now contradict."""
         a, b = sorted(pair, key=self._sessions.robots.index)
-        if not self._comparison.is_outdated(pair, sum(len(self._graph.path(session)) for session in pair)):
+        if not self.comparison.is_outdated(pair, sum(len(self._graph.path(session)) for session in pair)):
             return False
         entries = self.closures.evidence(a, b)
-        decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self._comparison.fit)
+        decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self.comparison.fit)
         if decision.dominant:
             self.joins[pair] = decision.evidence
         return self._is_contested(decision, entries)

@@ -6,7 +6,7 @@ evidence may revoke a join. ``finalize`` depends on the set of packets only, not
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import NamedTuple, Protocol, Self
 
 from fcslam.cloud.claims import LONGEST_CLOSURE_M, check_constraint, check_submap, with_least_noise
 from fcslam.cloud.closure_log import ClosureEntry
@@ -45,6 +45,12 @@ from fcslam.records import (
 )
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
+
+
+class _Part(Protocol):
+    def state(self) -> State: ...
+
+    def restore(self, state: State) -> None: ...
 
 
 class _Replayed(NamedTuple):
@@ -134,14 +140,18 @@ class Fleet:
 
     def state(self) -> State:
         """The state after the packets so far, without what those hold; ``restored`` makes an equal fleet of it."""
+        return {"needs_replay": self._needs_replay, **{name: part.state() for name, part in self._parts().items()}}
+
+    def _parts(self) -> dict[str, "_Part"]:
         return {
-            "sessions": self._sessions.state(),
-            "graph": self._graph.state(),
-            "decisions": self._decisions.state(),
-            "recognition": self._recognition.state(),
-            "quality": self._quality.state(),
-            "needs_replay": self._needs_replay,
-            "tags": self._tags.state(),
+            "sessions": self._sessions,
+            "graph": self._graph,
+            "closures": self._decisions.closures,
+            "comparison": self._decisions.comparison,
+            "decisions": self._decisions,
+            "recognition": self._recognition,
+            "tags": self._tags,
+            "quality": self._quality,
         }
 
     @classmethod
@@ -152,19 +162,17 @@ class Fleet:
         state: State,
         read: Callable[[PacketNumber], Packet],
         verify_pairs: VerifyPairs = verify_here,
+        changes: Sequence[Change] = (),
     ) -> Self:
-        """The fleet of a ``state`` under the same configuration and seed.
+        """The fleet of a ``state`` under the same configuration and seed, and the same changes by hand in force.
 
         ``read`` gives the packets that it applied; the fleet reads keyscans when it needs them.
         """
         fleet = cls(config, seed, verify_pairs, read)
-        fleet._sessions.restore(state["sessions"])
-        fleet._graph.restore(state["graph"])
-        fleet._decisions.restore(state["decisions"])
-        fleet._sessions.name_floors(floors(fleet._decisions.changes))
-        fleet._recognition.restore(state["recognition"])
-        fleet._tags.restore(state["tags"])
-        fleet._quality.restore(state["quality"])
+        fleet._decisions.changes = tuple(changes)
+        fleet._sessions.name_floors(floors(changes))
+        for name, part in fleet._parts().items():
+            part.restore(state[name])
         fleet._needs_replay = state["needs_replay"]
         return fleet
 
@@ -211,6 +219,9 @@ class Fleet:
         graph = JointGraph()
         graph.restore(self._graph.state())
         decisions = ClosureDecisions(self._config, self._sessions, graph)
+        decisions.changes = self._decisions.changes
+        for name in ("closures", "comparison"):
+            getattr(decisions, name).restore(getattr(self._decisions, name).state())
         decisions.restore(self._decisions.state())
         fusion = decisions.reevaluate(final=True)
         if self._config.fusion is not FusionStrategy.JOINT:
@@ -234,7 +245,7 @@ class Fleet:
         replayed, self._replayed = self._replayed, None
         if replayed is not None and order[: len(replayed.order)] == replayed.order:
             done = len(replayed.order)
-            replay = Fleet.restored(self._config, self._seed, replayed.state, read, self._verify_pairs)
+            replay = Fleet.restored(self._config, self._seed, replayed.state, read, self._verify_pairs, changes)
         else:
             replay = Fleet(self._config, self._seed, self._verify_pairs)
             replay.edit(changes)

@@ -1,7 +1,7 @@
 """The pose graph of the whole fleet: every robot's keyscans, their constraints, the closures between robots."""
 
 from collections.abc import Collection, Container, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -170,13 +170,7 @@ class JointGraph:
         return {
             "initial": self.graph.poses(),
             "poses": self._poses.values,
-            "edges": {
-                "i": edges.i,
-                "j": edges.j,
-                "T_i_j": edges.T_i_j,
-                "information": edges.information,
-                "robust": edges.robust,
-            },
+            "edges": {field.name: getattr(edges, field.name) for field in fields(edges)},
             "left_out": sorted(self._left_out),
             "unsolved": self._unsolved,
             "changed": sorted(self._changed),

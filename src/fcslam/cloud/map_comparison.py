@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,7 @@ from fcslam.lidar.map_agreement import LocalSubmap, Noise, PlaceAgreement, compa
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.records import FloatArray, Keyscan, KeyscanId, frozen
-from fcslam.storage.snapshot import from_state, to_state
-from fcslam.storage.state_file import State
+from fcslam.storage.snapshot import Kept
 
 REACH_M = 45.0
 """Keyscans up to this far from the middle of the matching places make a map: of both wings of a building that repeats
@@ -78,8 +78,10 @@ class _Compared:
         return replace(self, i=self.j, j=self.i, T_i_j=frozen(se2.inverse(self.T_i_j)))
 
 
-class MapComparison:
+class MapComparison(Kept):
     """Compares maps that it builds from the keyscans of sessions."""
+
+    KEPT: ClassVar = {"_compared": dict[frozenset[str], list[_Compared]]}
 
     def __init__(self, sessions: SessionStore) -> None:
         self._sessions = sessions
@@ -168,14 +170,6 @@ class MapComparison:
         """Compare the maps of two sessions at poses (N, 3) of their keyscans in the frame of one map."""
         local_maps = _LocalMaps(self._keyscans_around, self._scans, sessions, (poses_a, poses_b))
         return _fit(local_maps.agreement(np.zeros_like(poses_b)))
-
-    def state(self) -> State:
-        """The state that ``restore`` needs."""
-        return {"compared": to_state(self._compared)}
-
-    def restore(self, state: State) -> None:
-        """Take over a ``state``."""
-        self._compared = from_state(dict[frozenset[str], list[_Compared]], state["compared"])
 
     def _map_around(self, session: str, poses: FloatArray, middle: FloatArray) -> _Near | None:
         """The session's map around a point (2,) in the frame of the poses (N, 3)."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -59,6 +59,17 @@ class _Session:
     """First and last keyscan behind the places at a keyscan, whichever detector described them."""
     fixes: dict[int, KeyscanFix] = field(default_factory=dict)
     """Of satellite navigation, by keyscan."""
+
+
+_KEPT: dict[str, Any] = {
+    "announced": set[tuple[Channel, str]],
+    "connected": int,
+    "T_odom_base": FloatArray | None,
+    "places": set[tuple[int, Channel, str]],
+    "spans": dict[tuple[int, Channel], tuple[int, int]],
+    "fixes": dict[int, KeyscanFix],
+}
+"""What a state has of each session as it is."""
 
 
 class SessionStore:
@@ -228,32 +239,35 @@ class SessionStore:
 
     def state(self) -> State:
         """The state that ``restore`` needs. Packets are stored anyway, so keyscans are named by theirs."""
-        return {name: _session_state(session) for name, session in self._sessions.items()}
+        return {
+            name: {
+                "hello": session.hello_sequence,
+                "keyscans": {
+                    "stamps": np.array([kept.stamp for kept in session.keyscans]),
+                    "sequences": np.array([kept.sequence for kept in session.keyscans], np.int64),
+                    "released": np.array([kept.is_released for kept in session.keyscans], np.bool_),
+                    "holders": np.array([kept.holders for kept in session.keyscans], np.int64),
+                },
+                **{attribute: to_state(getattr(session, attribute)) for attribute in _KEPT},
+            }
+            for name, session in self._sessions.items()
+        }
 
     def restore(self, state: State) -> None:
         """Take over a ``state``; keyscans are read when they are needed."""
         for name, stored in state.items():
-            session = self._sessions[name] = self._restored(name, stored)
-            self._unread += [
-                KeyscanId(name, number) for number, kept in enumerate(session.keyscans) if not kept.is_released
-            ]
-
-    def _restored(self, name: str, state: State) -> _Session:
-        columns = (state["keyscans"][key].tolist() for key in ("stamps", "sequences", "released", "holders"))
-        return _Session(
-            hello=self._stored(PacketNumber(name, state["hello"]), Hello),
-            hello_sequence=state["hello"],
-            announced=from_state(set[tuple[Channel, str]], state["announced"]),
-            keyscans=[
-                _KeptKeyscan(stamp, sequence, None, is_released, holders)
-                for stamp, sequence, is_released, holders in zip(*columns, strict=True)
-            ],
-            connected=state["connected"],
-            T_odom_base=from_state(FloatArray | None, state["T_odom_base"]),
-            places=from_state(set[tuple[int, Channel, str]], state["places"]),
-            spans=from_state(dict[tuple[int, Channel], tuple[int, int]], state["spans"]),
-            fixes=from_state(dict[int, KeyscanFix], state["fixes"]),
-        )
+            columns = (stored["keyscans"][key].tolist() for key in ("stamps", "sequences", "released", "holders"))
+            self._sessions[name] = _Session(
+                self._stored(PacketNumber(name, stored["hello"]), Hello),
+                stored["hello"],
+                keyscans=[
+                    _KeptKeyscan(stamp, sequence, None, is_released, holders)
+                    for stamp, sequence, is_released, holders in zip(*columns, strict=True)
+                ],
+                **{attribute: from_state(kind, stored[attribute]) for attribute, kind in _KEPT.items()},
+            )
+            kept = enumerate(self._sessions[name].keyscans)
+            self._unread += [KeyscanId(name, number) for number, keyscan in kept if not keyscan.is_released]
 
     def _keyscan(self, robot: str, number: int) -> Keyscan | None:
         """A keyscan, read if it was not yet; None if it was released."""
@@ -278,21 +292,3 @@ class SessionStore:
             raise PacketError(f"{robot}: a keyscan is not of laser {keyscan.laser}: {reason}")
         if keyscan.beams is None and len(keyscan.ranges_m) != announced.beam_count:
             raise PacketError(f"{robot}: {len(keyscan.ranges_m)} beams, {announced.beam_count} announced")
-
-
-def _session_state(session: _Session) -> State:
-    return {
-        "hello": session.hello_sequence,
-        "announced": to_state(session.announced),
-        "keyscans": {
-            "stamps": np.array([kept.stamp for kept in session.keyscans]),
-            "sequences": np.array([kept.sequence for kept in session.keyscans], np.int64),
-            "released": np.array([kept.is_released for kept in session.keyscans], np.bool_),
-            "holders": np.array([kept.holders for kept in session.keyscans], np.int64),
-        },
-        "connected": session.connected,
-        "places": to_state(session.places),
-        "spans": to_state(session.spans),
-        "fixes": to_state(session.fixes),
-        "T_odom_base": to_state(session.T_odom_base),
-    }

@@ -8,6 +8,7 @@ camera is calibrated wrongly.
 from collections import Counter
 from collections.abc import Collection
 from itertools import islice
+from typing import ClassVar
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from fcslam.records import (
     TagSighting,
     frozen,
 )
-from fcslam.storage.snapshot import from_state, to_state
+from fcslam.storage.snapshot import Kept
 from fcslam.storage.state_file import State
 
 MOST_SENDERS = 10
@@ -44,8 +45,13 @@ REVISIT_M = 10.0
 """Path after which a session that sees a tag again has come back to it."""
 
 
-class SeenTags:
+class SeenTags(Kept):
     """The sightings of every tag, by session."""
+
+    KEPT: ClassVar = {
+        "_seen": dict[Tag, dict[str, dict[int, TagSighting]]],
+        "_paired": dict[Tag, set[tuple[KeyscanId, str]]],
+    }
 
     def __init__(self, sessions: SessionStore, graph: JointGraph) -> None:
         self._sessions = sessions
@@ -101,14 +107,9 @@ class SeenTags:
             for one in self._seen[tag][session].values()
         )
 
-    def state(self) -> State:
-        """The state that ``restore`` needs."""
-        return {"seen": to_state(self._seen), "paired": to_state(self._paired)}
-
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
-        self._seen = from_state(dict[Tag, dict[str, dict[int, TagSighting]]], state["seen"])
-        self._paired = from_state(dict[Tag, set[tuple[KeyscanId, str]]], state["paired"])
+        super().restore(state)
         every = [one for sessions in self._seen.values() for own in sessions.values() for one in own.values()]
         self._tags = Counter(one.id for one in every)
         self._ends = Counter(frozenset((one.robot, name)) for pairs in self._paired.values() for one, name in pairs)

@@ -7,11 +7,28 @@ from collections.abc import Mapping, Set
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import cache
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from fcslam.records import frozen
+from fcslam.storage.state_file import State
+
+
+class Kept:
+    """A part of a program whose state is that of some attributes."""
+
+    KEPT: ClassVar[Mapping[str, Any]]
+    """Their names and types."""
+
+    def state(self) -> State:
+        """The state that ``restore`` takes."""
+        return {name: to_state(getattr(self, name)) for name in self.KEPT}
+
+    def restore(self, state: State) -> None:
+        """Take over a ``state``."""
+        for name, kind in self.KEPT.items():
+            setattr(self, name, from_state(kind, state[name]))
 
 
 def to_state(value: Any) -> Any:
