@@ -47,7 +47,7 @@ SEEDS = (1, 2, 3, 4, 5)
 ROBOT = "anna"
 KINDS = {
     "a leaning laser": "sees the floor",
-    "facing": "contradict the odometry|turn against the odometry|of one robot",
+    "facing": "contradict the odometry|topics of one robot",
     "scale of distances": "the robot's distance is",
     "scale of turns": "the robot's turn is",
     "clocks": "the clock of the odometry",

@@ -39,7 +39,6 @@ def start(tmp_path):
         opened[-1].begin("r", resume)
         frontend = Frontend()
         updates = DetectorUpdates(tmp_path / "detectors", opened[-1], frontend)
-        updates.resume()
         return updates, frontend
 
     yield start

@@ -206,7 +206,7 @@ def test_what_was_refused_in_an_answer_that_was_lost_is_set_aside(robot):
         robot.step()
     assert robot.refused == [(content(encode(packets[1])), "unwanted")]
     assert (robot.sender.confirmed, robot.sender.refusals) == (2, 1)
-    assert "1; the last is packet 1 of start 0: unwanted" in robot.sender.refused_notice
+    assert "1; the last is packet 1 of start 0: unwanted" in " ".join(robot.sender.notices)
 
 
 def test_a_robot_says_that_it_is_removed_and_no_longer_when_it_is_back(robot):
@@ -215,19 +215,19 @@ def test_a_robot_says_that_it_is_removed_and_no_longer_when_it_is_back(robot):
         robot.network.cloud.removed = removed
         robot.now += 10.0
         robot.sender.step()
-        assert (robot.sender.removed_notice is not None) == removed
+        assert bool(robot.sender.notices) == removed
 
 
 def test_what_the_cloud_refuses_after_it_confirmed_it_is_told(robot):
     network = robot.network
     robot.outbox.put([said(k) for k in range(3)])
     robot.step()
-    assert robot.sender.refused_notice is None
+    assert not robot.sender.notices
     network.cloud.refused[0, 1] = "no such keyscan"
     robot.outbox.put([said(3)])
     before = network.requests
     robot.step()
-    assert "packet 1 of start 0: no such keyscan" in robot.sender.refused_notice
+    assert "packet 1 of start 0: no such keyscan" in " ".join(robot.sender.notices)
     assert network.requests == before + 2, "the batch, and what became of the packets"
     robot.outbox.put([said(4)])
     robot.step()
@@ -281,7 +281,7 @@ def test_a_cloud_that_opens_another_mission_is_found_out_and_gets_the_next_start
     assert list(network.cloud.stored) == [(0, 2), (0, 3), (1, 0), (1, 1)], "it was sent before it was found out"
     assert [data for data, _ in anew.refused] == [content(encode(said(k))) for k in (2, 3)]
     assert "another mission" in anew.refused[0][1]
-    assert anew.sender.notice.startswith("2 packets of earlier starts belong to another mission")
+    assert "2 packets of earlier starts belong to another mission" in anew.sender.notices[0]
     assert (anew.sender.confirmed, anew.sender.refusals) == (2, 2)
     assert anew.outbox.waiting == (0, 0)
     anew.outbox.close()

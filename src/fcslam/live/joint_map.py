@@ -13,12 +13,12 @@ from fcslam.geometry import se2
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, draw_over
 from fcslam.live.fleet_view import FleetView
+from fcslam.live.map_poses import CorrectedOdometry
 from fcslam.live.records import RobotPose
 from fcslam.live.teammates import beams_on_teammates
 from fcslam.maps.joint_tiles import padded
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, without
-from fcslam.robot.corrected_odometry import CorrectedOdometry
 from fcslam.robot.track import ScanTrack
 from fcslam.warmup import made_up_scans
 from fcslam.wire.messages import Hello, Packet

@@ -2,12 +2,52 @@
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.records import Correction, FloatArray
-from fcslam.robot.corrected_odometry import CorrectedOdometry
+from fcslam.records import Correction, FloatArray, frozen
+
+
+class CorrectedOdometry:
+    """``T_map_base = T_map_odom T_odom_base``. A correction moves ``odom`` in ``map``, never the robot in ``odom``: a
+    controller that uses ``odom`` sees no jump."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self.correction: Correction | None = None
+        """The newest one; None before the first one, as all that follows from it."""
+        self._arrived_s = 0.0
+
+    def correct(self, correction: Correction) -> None:
+        """Apply a correction unless a newer one was applied before. Any thread may call this."""
+        if self.correction is None or correction.version > self.correction.version:
+            self.correction, self._arrived_s = correction, self._clock()
+
+    def move(self, T_map_odom: FloatArray) -> None:
+        """Move ``odom`` in the map of the newest correction, as shape (3,)."""
+        if self.correction is not None:
+            self.correction = replace(self.correction, T_map_odom=frozen(T_map_odom))
+
+    @property
+    def map_index(self) -> int | None:
+        """Index of the robot's map."""
+        return None if self.correction is None else self.correction.map_index
+
+    @property
+    def quality(self) -> float:
+        """Quality of the newest correction, in [0, 1], as in ``Correction``; 0 before the first one."""
+        return 0.0 if self.correction is None else self.correction.quality
+
+    @property
+    def age_s(self) -> float | None:
+        """Time since the newest correction, seconds."""
+        return None if self.correction is None else self._clock() - self._arrived_s
+
+    def T_map_base(self, T_odom_base: FloatArray) -> FloatArray | None:
+        """Poses of ``base`` in the map, given those in ``odom``, shape (..., 3), metres and radians."""
+        return None if self.correction is None else se2.compose(self.correction.T_map_odom, T_odom_base)
 
 
 class MapPoses:

@@ -175,23 +175,18 @@ def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
     motions, odometry = _tracked(bag.records(), config, assumed_s)
     if len(motions.stamps) < 2:
         return Calibrated(MotionCalibration(), BagCorrection(), ())
-    if odometry is None:
-        known = np.isfinite(motions.T_local_base[:, 0])
-        odometry = OdometryTrack(motions.stamps[known], _unwrapped(motions.T_local_base[known]))
-        calibration = MotionCalibration(sweep_share=calibrate(motions, odometry).sweep_share)
-    else:
+    if odometry is not None:
         calibration = calibrate(motions, odometry)
+    else:
+        known = np.isfinite(motions.T_local_base[:, 0])
+        by_scans = OdometryTrack(motions.stamps[known], _unwrapped(motions.T_local_base[known]))
+        calibration = MotionCalibration(sweep_share=calibrate(motions, by_scans).sweep_share)
     scale = calibration.turn_scale
     if scale is not None and not 1.0 / LARGEST_SCALE < scale.value < LARGEST_SCALE:
-        is_sure = calibration.delay is not None or _is_wrong(scale)  # a long drive, or a clear one
-        lines = _contradiction(scale, survey.lasers[0].beams) if is_sure else ()
-        return Calibrated(calibration, BagCorrection(), lines)
+        return Calibrated(calibration, BagCorrection(), tuple(_scale_lines(calibration, survey.lasers[0].beams)))
     if odometry is not None and odometry.period_s > LONGEST_PERIOD_S:
         calibration = replace(calibration, delay=None)
-    if (
-        _is_wrong(distance := calibration.distance_scale)
-        and not 1.0 / LARGEST_WHEEL_SCALE < distance.value < LARGEST_WHEEL_SCALE
-    ):
+    if _is_wrong(distance := calibration.distance_scale) and not _is_of_wheels(distance):
         calibration = replace(calibration, mounting=None)  # in which unit, is not known
     assumed = float(np.median(motions.first_s)), float(np.median(motions.last_s))
     found = _corrected(calibration, assumed, _stated_share(bag.plan.stated_sweep, assumed_s))
@@ -205,43 +200,35 @@ def _is_wrong(scale: Estimate | None) -> TypeGuard[Estimate]:
     return scale is not None and (scale.differs(1.0, 5.0 * LEAST_SCALE) or scale.differs(1.0, GROSS_SCALE, sigmas=3.0))
 
 
+def _is_of_wheels(scale: Estimate) -> bool:
+    """Whether the distances by odometry may be wrong by so much; else the unit of the ranges may be."""
+    return 1.0 / LARGEST_WHEEL_SCALE < scale.value < LARGEST_WHEEL_SCALE
+
+
 def _scale_lines(calibration: MotionCalibration, beams: Beams) -> Iterator[str]:
     distance, turn = calibration.distance_scale, calibration.turn_scale
+    if _is_wrong(turn) and not 1.0 / LARGEST_SCALE < turn.value < LARGEST_SCALE:
+        yield _scale_line(
+            "turn",
+            turn,
+            "correct the mounting of the laser in tf, which may be upside down, or the heading of the odometry, or "
+            "choose topics of one robot by --sensors scan-topic and odom-topic",
+        )
+        return
     if _is_wrong(distance):
-        is_wheel = 1.0 / LARGEST_WHEEL_SCALE < distance.value < LARGEST_WHEEL_SCALE
-        unit = "" if is_wheel else ", or the unit of the ranges, which may be feet"
+        unit = "" if _is_of_wheels(distance) else ", or the unit of the ranges, which may be feet"
         yield _scale_line("distance", distance, f"correct the radius of the wheels in its driver{unit}")
     if _is_wrong(turn):
-        yield _scale_line("turn", turn, _turn_remedy(turn.value, beams))
-
-
-def _turn_remedy(turn: float, beams: Beams) -> str:
-    wheels = "correct the distance of the wheels in its driver"
-    stated_deg = math.degrees(beams.span_rad + beams.angle_increment_rad)
-    span_deg = stated_deg / turn
-    if span_deg > LARGEST_SPAN_DEG:
-        return wheels
-    return f"{wheels}, or the angles of the beams, which then span {span_deg:.0f} deg and not {stated_deg:.0f}"
+        remedy = "correct the distance of the wheels in its driver"
+        stated_deg = math.degrees(beams.span_rad + beams.angle_increment_rad)
+        if (span_deg := stated_deg / turn.value) <= LARGEST_SPAN_DEG:
+            remedy += f", or the angles of the beams, which then span {span_deg:.0f} deg and not {stated_deg:.0f}"
+        yield _scale_line("turn", turn, remedy)
 
 
 def _scale_line(name: str, scale: Estimate, remedy: str) -> str:
     return (
         f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f}); not corrected: {remedy}"
-    )
-
-
-def _contradiction(scale: Estimate, beams: Beams) -> tuple[str, ...]:
-    if abs(scale.value + 1.0) < 0.3:
-        return (
-            "the scans turn against the odometry: the laser is mounted upside down, or the heading of the odometry has "
-            "the wrong sign; not corrected: correct the mounting in tf, or the driver, or give --sensors "
-            "odom-topic=none",
-        )
-    return (
-        f"the turns of the scans are {scale.value:.2f} (+- {scale.sigma:.2f}) of what odometry says: they are not of "
-        "one robot, or one of both is broken; not corrected: choose the topics by --sensors scan-topic and odom-topic, "
-        "or "
-        f"{_turn_remedy(scale.value, beams)}",
     )
 
 
@@ -262,10 +249,7 @@ def _tracked(
     frontend = LidarFrontend("calibration", config, PREDICTED)
     prediction, mapped, repeated = MotionPrediction(), MappedScans(config.ignore, config.footprint), RepeatedScans()
     unknown = np.full(3, np.nan)
-    stamps: list[float] = []
-    poses: list[FloatArray] = []
-    turned: list[float] = []
-    times: list[tuple[float, float]] = []
+    rows: list[tuple[float, ...]] = []
     odometry: list[Odometry] = []
     turn_rad = 0.0
     for record in records:
@@ -273,23 +257,22 @@ def _tracked(
             odometry.append(record)
         if not isinstance(record, LaserScan) or not repeated.admits(record):
             continue
-        if len(stamps) == MOST_SCANS or turn_rad > ENOUGH_TURN_RAD:
+        if len(rows) == MOST_SCANS or turn_rad > ENOUGH_TURN_RAD:
             break
         beams = Sweep(*_times(record.sweep, assumed_s))
         scan = prediction.predict(mapped.of(replace(record, T_odom_base=unknown, sweep=beams)))
-        tracked = frontend.localize(scan)
-        frontend.process(scan, tracked)
-        sweep, is_matched = tracked.tracked.sweep, bool(tracked.tracked.information.any())
+        tracking = frontend.localize(scan)
+        frontend.process(scan, tracking)
+        sweep, is_matched = tracking.tracked.sweep, bool(tracking.tracked.information.any())
         assert sweep is not None
-        prediction.observe(scan.stamp, tracked.tracked.T_local_base if is_matched else None, sweep)
+        pose = tracking.tracked.T_local_base if is_matched else None
+        prediction.observe(scan.stamp, pose, sweep)
         turn = float(sweep.displacement(sweep.last_s)[2] - sweep.displacement(sweep.first_s)[2])
-        stamps.append(scan.stamp)
-        poses.append(tracked.tracked.T_local_base if is_matched else unknown)
-        turned.append(turn if is_matched else np.nan)
-        times.append((sweep.first_s, sweep.last_s))
+        found = unknown if pose is None else pose
+        rows.append((scan.stamp, *found, turn if is_matched else np.nan, sweep.first_s, sweep.last_s))
         turn_rad += abs(turn)
-    first_s, last_s = np.array(times).reshape(-1, 2).T
-    motions = ScanMotions(np.array(stamps), np.array(poses).reshape(-1, 3), np.array(turned), first_s, last_s)
+    columns = np.array(rows).reshape(-1, 7).T
+    motions = ScanMotions(columns[0], columns[1:4].T, columns[4], columns[5], columns[6])
     return motions, _track_of(odometry)
 
 

@@ -19,12 +19,10 @@ class DetectorUpdates:
     """Passes new detectors from the thread that downloads them to the one that uses them."""
 
     def __init__(self, folder: Path, outbox: Outbox, frontend: RobotFrontend) -> None:
-        """``folder`` holds the files; the outbox records when each was applied."""
-        self._folder = folder
-        self._outbox = outbox
-        self._frontend = frontend
+        """``folder`` holds the files; the outbox records when each was applied, also before an interruption."""
+        self._folder, self._outbox, self._frontend = folder, outbox, frontend
         self._fetched: queue.SimpleQueue[DetectorFile] = queue.SimpleQueue()
-        self._applied: dict[int, DetectorFile] = {}
+        self._applied = outbox.detector_updates()
         self._last: tuple[DetectorFile, Future[list[Body]]] | None = None
         """The last update, and whether the back end took it."""
 
@@ -34,13 +32,7 @@ class DetectorUpdates:
         if self._last is None or not self._last[1].done():
             return None
         file, error = self._last[0], self._last[1].exception()
-        if error is not None:
-            return f"detector {file.version} not taken: {error}"
-        return f"detector {file.version} from now on"
-
-    def resume(self) -> None:
-        """Load the updates that this recording applied before it was interrupted."""
-        self._applied = self._outbox.detector_updates()
+        return f"detector {file.version} " + ("from now on" if error is None else f"not taken: {error}")
 
     def store(self, file: DetectorFile, content: bytes) -> None:
         """Store a downloaded detector. Called by the sender."""
@@ -53,26 +45,21 @@ class DetectorUpdates:
             ) from error
         self._fetched.put(file)
 
-    @property
-    def has_news(self) -> bool:
-        """Whether a detector waits that the front end has not got."""
-        return not self._fetched.empty()
-
     def is_due(self, record: int) -> bool:
-        """Whether an interrupted recording applied a detector before this record."""
-        return record in self._applied
+        """Whether a new detector waits, or an interrupted recording applied one before this record."""
+        return record in self._applied or not self._fetched.empty()
 
     def apply_due(self, record: int, catching_up: bool) -> None:
         """Give the front end the detector that is due before this record, counted from 0."""
-        file = self._applied.get(record)
-        is_new = not catching_up and record > max(self._applied, default=-1)
-        if file is None and is_new and not self._fetched.empty():
+        newest = max(self._applied, default=-1)
+        if not catching_up and record > newest and not self._fetched.empty():
             file = self._fetched.get()
-            if self._applied and file == self._applied[max(self._applied)]:
+            if file == self._applied.get(newest):
                 return
             self._outbox.record_detector_update(record, file)
             self._applied[record] = file
-        if file is not None:
+        if record in self._applied:
+            file = self._applied[record]
             self._last = file, self._frontend.set_detector(file, self._path(file))
 
     def _path(self, file: DetectorFile) -> Path:

@@ -77,10 +77,8 @@ class Outbox:
         """Open the file at ``path``, or create it."""
         self._path = path
         self._limit_bytes = limit_bytes
-        self.epoch = -1
-        """Epoch of the newest session."""
-        self._first = -1
-        """Epoch of the first session of this start."""
+        self.epoch = self.first_epoch = -1
+        """Epochs of the newest session and of the first one of this start."""
         with self._state_errors():
             self._database = Database(path, _SCHEMA, _VERSION, exclusive=True)
         try:
@@ -128,16 +126,11 @@ class Outbox:
                         f"{self._path}: left by another recording, other settings or another version; "
                         "leave --resume out to start anew"
                     )
-                self._first = int(last)
+                self.first_epoch = int(last)
                 (self.epoch,) = _one(connection, "SELECT max(epoch) FROM sessions")
             else:
-                self._first = self._open_session(connection, 0, recording)
-            return int(_one(connection, "SELECT count(*) FROM packets WHERE epoch >= ?", self._first)[0])
-
-    @property
-    def first_epoch(self) -> int:
-        """Epoch of the first session of this start."""
-        return self._first
+                self.first_epoch = self._open_session(connection, 0, recording)
+            return int(_one(connection, "SELECT count(*) FROM packets WHERE epoch >= ?", self.first_epoch)[0])
 
     @property
     def is_synchronized(self) -> bool:
@@ -146,7 +139,7 @@ class Outbox:
 
     def session_of(self, epoch: int) -> int | None:
         """The session of this start with this epoch; None for epochs of earlier starts."""
-        rows = self._rows("SELECT session FROM sessions WHERE epoch = ? AND epoch >= ?", (epoch, self._first))
+        rows = self._rows("SELECT session FROM sessions WHERE epoch = ? AND epoch >= ?", (epoch, self.first_epoch))
         return int(rows[0][0]) if rows else None
 
     @property
@@ -189,7 +182,7 @@ class Outbox:
             "AND epoch NOT IN (SELECT epoch FROM packets WHERE data IS NULL AND sequence NOT NULL) "
             "ORDER BY epoch, sequence"
         )
-        return [bytes(data) for (data,) in self._rows(question, (self._first,))]
+        return [bytes(data) for (data,) in self._rows(question, (self.first_epoch,))]
 
     def record_detector_update(self, record: int, file: DetectorFile) -> None:
         """Store that the front end applied a detector update before this record of the session."""
@@ -200,7 +193,7 @@ class Outbox:
     def detector_updates(self) -> dict[int, DetectorFile]:
         """The detector updates that this start has applied, by record."""
         columns = "record, channel, version, format, size, sha256"
-        rows = self._rows(f"SELECT {columns} FROM releases WHERE epoch >= ?", (self._first,))
+        rows = self._rows(f"SELECT {columns} FROM releases WHERE epoch >= ?", (self.first_epoch,))
         return {record: DetectorFile(Channel(channel), *rest) for record, channel, *rest in rows}
 
     def batch(self, maximum_bytes: int, maximum_packets: int) -> PacketBatch | None:
@@ -296,7 +289,7 @@ class Outbox:
             connection.execute(f"UPDATE {table} SET epoch = ? WHERE epoch = ?", (to, epoch))
         self.waiting = WaitingPackets(*_count(connection, _IS_WAITING))
         self.epoch = to if self.epoch == epoch else self.epoch
-        self._first = to if self._first == epoch else self._first
+        self.first_epoch = to if self.first_epoch == epoch else self.first_epoch
 
     def _agent_of(self, robot: str) -> str:
         with self._transaction() as connection:
@@ -314,10 +307,10 @@ class Outbox:
         return self.epoch
 
     def _epoch_of(self, connection: sqlite3.Connection, session: int) -> int:
-        row = _one(connection, "SELECT epoch FROM sessions WHERE session = ? AND epoch >= ?", session, self._first)
+        row = _one(connection, "SELECT epoch FROM sessions WHERE session = ? AND epoch >= ?", session, self.first_epoch)
         if row is not None:
             return int(row[0])
-        (recording,) = _one(connection, "SELECT recording FROM sessions WHERE epoch = ?", self._first)
+        (recording,) = _one(connection, "SELECT recording FROM sessions WHERE epoch = ?", self.first_epoch)
         return self._open_session(connection, session, recording)
 
     def _is_known(self, connection: sqlite3.Connection, epoch: int, ordinal: int, digest: bytes) -> bool:

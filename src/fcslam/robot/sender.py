@@ -47,13 +47,8 @@ class Sender:
     ) -> None:
         """Callbacks run in the thread of ``step``: ``correct`` gets the epoch and correction of the newest session,
         ``keep`` a downloaded detector, ``refused`` a refused packet and the reason."""
-        self._outbox = outbox
-        self._transport = transport
-        self._rng = rng
-        self._clock = clock
-        self._correct = correct
-        self._keep = keep
-        self._refused = refused
+        self._outbox, self._transport, self._rng, self._clock = outbox, transport, rng, clock
+        self._correct, self._keep, self._refused = correct, keep, refused
         self._is_synchronized = False
         self._batch_packets = MAXIMUM_BATCH_PACKETS
         """Largest number of packets in a batch; halved when the cloud refuses the size."""
@@ -71,14 +66,16 @@ class Sender:
         self.refusals = 0
         self.trouble: str | None = CONNECTING
         """Why packets do not arrive; None if they do."""
-        self.notice: str | None = None
-        """Message about packets of earlier starts that belong to another mission; None if there were none."""
-        self.refused_notice: str | None = None
-        """Message about refused packets, some of them refused after confirmation; None if there were none."""
-        self.removed_notice: str | None = None
-        """Message that this session is removed from the mission; None if it is not."""
+        self._orphans = self._refused_packets = self._removed = ""
+        """Messages about packets of earlier starts that belong to another mission, about refused packets, some of them
+        refused after confirmation, and about the removal of this session; empty if there is nothing to say."""
         self.failure: Exception | None = None
         """The error that ended ``run``."""
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """Messages about packets of another mission, refused packets and the removal of this session."""
+        return tuple(filter(None, (self._orphans, self._refused_packets, self._removed)))
 
     def run(self, stop: threading.Event) -> None:
         """Send until ``stop`` is set or an error occurs, as a cloud that rejects the robot; see ``failure``."""
@@ -131,7 +128,7 @@ class Sender:
                 epoch, sequence, f"epoch {epoch} belongs to another mission: the cloud does not have its first packets"
             )
         if orphans:
-            self.notice = f"{len(orphans)} packets of earlier starts belong to another mission: moved to refused"
+            self._orphans = f"{len(orphans)} packets of earlier starts belong to another mission: moved to refused"
         self._read_refusals(state)
         for epoch, sequence in state.expected.items():
             self.confirmed += self._outbox.acknowledge(epoch, sequence - 1)
@@ -140,7 +137,7 @@ class Sender:
         """Set refused packets aside: those whose reply was lost, and those refused after they were confirmed."""
         for (epoch, sequence), reason in state.refused.items():
             self._set_aside(epoch, sequence, reason)
-            self.refused_notice = (
+            self._refused_packets = (
                 f"packets of this robot that the cloud refused: {len(state.refused)}; the last is packet {sequence} of "
                 f"start {epoch}: {reason}"
             )
@@ -152,7 +149,7 @@ class Sender:
         reply = self._transport.send(packets, self._correction)
         self._last_reply_s = self._clock()
         self._read(reply)
-        self.removed_notice = REMOVED if reply.removed else None
+        self._removed = REMOVED if reply.removed else ""
         if batch is not None and reply.refusal is not None:
             sequence = batch.first + reply.refusal[0]
             self.confirmed += self._outbox.acknowledge(batch.epoch, sequence - 1)

@@ -4,11 +4,11 @@ One thread encodes the packets and puts them into the outbox, which is on disk, 
 disk nor the network delays the pose of a scan.
 """
 
+import hashlib
 import threading
-from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -75,20 +75,13 @@ class Uplink:
             known: number of packets that the outbox has from before an interruption, and that come again.
             budget: None: every packet is sent.
         """
-        self._outbox = outbox
-        self._refused = folder / "refused"
-        self._budget = budget
-        self._correct_session = correct
-        self._known = known
+        self._outbox, self._refused, self._budget = outbox, folder / "refused", budget
+        self._correct_session, self._known = correct, known
         self._detector_updates = DetectorUpdates(folder / "detectors", outbox, frontend)
-        self._detector_updates.resume()
-        self._refused_files: int | None = None
-        """Number of files of refused packets; None until they are counted, as there may be many."""
         self._put = self._crowded_out = self._records = 0
         self._storing = ThreadPoolExecutor(1, "outbox")
-        self._unstored: deque[Future[None]] = deque()
-        """Packets on their way into the outbox."""
-        self._unstored_lock = threading.Lock()
+        self._given = self._stored = 0
+        """Batches of packets that were given to the outbox, and those of them that it has handled."""
         self._storing_failure: Exception | None = None
         self._sender: Sender | None = None
         self._stop = threading.Event()
@@ -106,14 +99,14 @@ class Uplink:
 
     def between_records(self) -> None:
         """Give the front end a detector that came while no record does: the robot stands still."""
-        # A resumed recording takes it at the same number again.
-        if self._detector_updates.has_news or self._detector_updates.is_due(self._records):
+        if self._detector_updates.is_due(self._records):
             self.before_record()
 
     def put(self, packets: Sequence[Packet]) -> None:
         """Store the next packets of the front end, later; none after the outbox failed."""
-        if packets and self._failure_of_storing() is None:
-            self._unstored.append(self._storing.submit(self._store, packets))
+        if packets:
+            self._given += 1
+            self._storing.submit(self._store, packets)
 
     def close(self) -> None:
         """Stop both threads; packets on their way into the outbox are stored, and wait there."""
@@ -125,13 +118,12 @@ class Uplink:
     @property
     def failure(self) -> Exception | None:
         """The error that ended one of the threads: a cloud that rejects the robot, or an outbox that cannot be used."""
-        failure = self._failure_of_storing()
-        return self._sender.failure if failure is None and self._sender is not None else failure
+        return self._storing_failure or (None if self._sender is None else self._sender.failure)
 
     @property
     def unstored(self) -> int:
         """Number of batches of packets on their way into the outbox."""
-        return len(self._unstored) if self.failure is None else 0
+        return self._given - self._stored if self.failure is None else 0
 
     @property
     def is_full(self) -> bool:
@@ -145,19 +137,12 @@ class Uplink:
 
     def status(self) -> UplinkStatus:
         """The counts so far."""
-        left_out = self._crowded_out + (0 if self._budget is None else self._budget.left_out)
-        status = UplinkStatus(left_out=left_out, is_catching_up=self._put < self._known)
-        sender = self._sender
+        left_out, sender = self._crowded_out + (self._budget.left_out if self._budget else 0), self._sender
+        is_catching_up = self._put < self._known
         if sender is None:
-            return status
-        return replace(
-            status,
-            waiting=self.waiting,
-            confirmed=sender.confirmed,
-            sent_bytes=sender.sent_bytes,
-            refused=sender.refusals,
-            trouble=sender.trouble,
-        )
+            return UplinkStatus(left_out=left_out, is_catching_up=is_catching_up)
+        counts = sender.confirmed, sender.sent_bytes, left_out, sender.refusals
+        return UplinkStatus(self.waiting, *counts, sender.trouble, is_catching_up)
 
     @property
     def trouble(self) -> str | None:
@@ -169,25 +154,18 @@ class Uplink:
         """Messages about packets of another mission, refused packets, removed sessions and the last detector update."""
         if self._sender is None:
             return ()
-        sender = self._sender
-        found = sender.notice, sender.refused_notice, sender.removed_notice, self._detector_updates.notice
-        return tuple(filter(None, found))
-
-    def _failure_of_storing(self) -> Exception | None:
-        """The error that ended the outbox; batches that were stored are forgotten, and all of them once it failed."""
-        with self._unstored_lock:
-            while self._unstored and self._unstored[0].done():
-                error = self._unstored.popleft().exception()
-                if isinstance(error, Exception):
-                    self._storing_failure = self._storing_failure or error
-                    self._unstored.clear()
-            return self._storing_failure
+        return tuple(filter(None, (*self._sender.notices, self._detector_updates.notice)))
 
     def _store(self, packets: Sequence[Packet]) -> None:
-        chosen = packets if self._budget is None else self._budget.fit(packets)
-        if chosen:
-            self._crowded_out += self._outbox.put(chosen)
-            self._put += len(chosen)
+        try:
+            chosen = packets if self._budget is None else self._budget.fit(packets)
+            if chosen and self._storing_failure is None:
+                self._crowded_out += self._outbox.put(chosen)
+                self._put += len(chosen)
+        except Exception as error:  # the thread that adds scans tells it
+            self._storing_failure = error
+        finally:
+            self._stored += 1
 
     def _correct(self, epoch: int, correction: Correction) -> None:
         session = self._outbox.session_of(epoch)
@@ -197,13 +175,10 @@ class Uplink:
     def _keep_refused(self, data: bytes, reason: str) -> None:
         try:
             self._refused.mkdir(parents=True, exist_ok=True)
-            if self._refused_files is None:
-                self._refused_files = len(list(self._refused.glob("*.bin")))
-            stem = f"{self._refused_files:06d}"
-            (self._refused / f"{stem}.bin").write_bytes(data)
-            (self._refused / f"{stem}.txt").write_text(reason + "\n", encoding="utf-8")
+            digest = hashlib.blake2b(data, digest_size=8).hexdigest()
+            (self._refused / f"{digest}.bin").write_bytes(data)
+            (self._refused / f"{digest}.txt").write_text(reason + "\n", encoding="utf-8")
         except OSError as error:
             raise InputError(
                 f"{self._refused}: cannot store a refused packet ({error}); free some space, then use --resume"
             ) from error
-        self._refused_files += 1

@@ -8,8 +8,8 @@ import pytest
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
+from fcslam.live.map_poses import CorrectedOdometry
 from fcslam.records import Correction, Keyscan
-from fcslam.robot.corrected_odometry import CorrectedOdometry
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
 from fcslam.wire.packets import decode, encode
