@@ -104,7 +104,7 @@ def test_sessions_stay_joined_when_the_places_that_joined_them_are_forgotten():
     fleet = feed(Cloud(FleetConfig(matcher=MatcherConfig(most_sessions_nearby=1)), 0), packets).fleet
     assert not fleet._sessions.keyscans("a")
     assert set(map_of(fleet.conclude()).values()) == {0}
-    fleet._decisions._comparison._compared.clear()
+    fleet._decisions.comparison._compared.clear()
     assert map_of(fleet.conclude())["a"] == 1, "without the earlier comparison it is separate"
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fcslam.cloud.manual_closures import measured
+from fcslam.cloud.decisions import measured
 from fcslam.geometry import se2
 from fcslam.records import ManualClosure
 from tests.lidar.test_submap_verification import EAST, WEST

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fcslam.cloud.joint_graph import JointGraph
-from fcslam.cloud.visits import COMPARED_ROBOTS, TIED_CLOSURES, Visit, visits_near, worth_comparing
+from fcslam.cloud.recognition import COMPARED_ROBOTS, TIED_CLOSURES, Visit, visits_near, worth_comparing
 from fcslam.records import Constraint, ConstraintKind, KeyscanId, frozen
 from tests.scripted import MOTION_INFORMATION
 

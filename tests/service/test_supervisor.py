@@ -6,7 +6,6 @@ import time
 
 import pytest
 
-from fcslam.cloud.stage_times import StageTotal
 from fcslam.processes import Child
 from fcslam.service.supervisor import Supervisor
 
@@ -71,15 +70,6 @@ def test_what_nobody_understands_is_left_out(supervised):
     supervisor, told = supervised("print('oh'); print('[1]'); print('{}');" + SAYS + "sys.stdin.read()")
     wait(lambda: told)
     assert (told, supervisor.starts) == ([("live", 7)], 1)
-
-
-def test_the_stages_of_the_present_worker_are_kept(supervised):
-    totals = [{"solve": (3, 1.0)}, {"solve": (4, 1.5)}]
-    says = "".join(f"print(json.dumps(dict(event='stages', content={total})));" for total in totals)
-    supervisor, told = supervised("import json;" + says + SAYS + "sys.stdin.read()")
-    wait(lambda: told)
-    assert told == [("live", 7)], "nobody else is told"
-    assert supervisor.stages == {"solve": StageTotal(4, 1.5)}
 
 
 def test_a_worker_that_cannot_be_started_is_tried_again(supervised, tmp_path):

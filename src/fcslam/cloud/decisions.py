@@ -12,24 +12,25 @@ import numpy as np
 
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.edits import is_cut, is_removed, stamps_of
-from fcslam.cloud.joining import CONSISTENCY, decide_join
+from fcslam.cloud.joining import CONSISTENCY, decide_join, reevaluate
 from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD, JointGraph
-from fcslam.cloud.manual_closures import Scans, measured
 from fcslam.cloud.map_comparison import MapComparison
-from fcslam.cloud.reevaluation import reevaluate
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.evidence import ClusterEvidence
-from fcslam.lidar.scan import keyscan_points
+from fcslam.lidar.scan import PointScan, keyscan_points
+from fcslam.lidar.submap import build_submap
+from fcslam.lidar.verification import VERIFICATION, verify
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
     Change,
     ClosureStatus,
     Constraint,
     Cut,
+    FloatArray,
     KeyscanId,
     ManualClosure,
     Pin,
@@ -51,6 +52,11 @@ DECIDED_GROWTH = 1.05
 decision tests every pair of closures: at each place, it would take longer than all else where robots meet for hours."""
 DECIDED_EACH_TIME = 100
 """Up to this many closures, two sessions are decided at each new one."""
+MOST_SIGMAS = 3.0
+"""Walls that fit only farther off than this many standard deviations of the user's pose show another place."""
+
+Scans = Sequence[tuple[PointScan, FloatArray]]
+"""Scans around a keyscan, and their poses (3,) in its base."""
 
 
 class ClosureDecisions(Kept):
@@ -314,3 +320,18 @@ def _explain(entries: Iterable[ClosureEntry], reason: Reason) -> None:
     for entry in entries:
         if entry.closure.status is ClosureStatus.VERIFIED:
             entry.set(ClosureStatus.VERIFIED, reason)
+
+
+def measured(made: ManualClosure, i: Scans, j: Scans) -> tuple[FloatArray, FloatArray]:
+    """Pose of j in i (3,) and its information (3, 3), as the walls around both ends refine them.
+
+    They are as the user gave them if the ends see too little in common, or fit only outside the user's tolerance.
+    """
+    metres, radians = made.tolerance
+    guess, information = np.array(made.T_i_j), np.diag([1.0 / metres**2, 1.0 / metres**2, 1.0 / radians**2])
+    if not all(any(len(scan.points) for scan, _ in scans) for scans in (i, j)):
+        return guess, information
+    found = verify(build_submap(i), build_submap(j), guess, VERIFICATION, information)
+    off = np.abs(se2.between(guess, found.T_a_b))
+    fits = found.loose and np.hypot(off[0], off[1]) <= MOST_SIGMAS * metres and off[2] <= MOST_SIGMAS * radians
+    return (found.T_a_b, found.information) if fits else (guess, information)

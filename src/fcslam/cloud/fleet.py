@@ -22,12 +22,10 @@ from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import in_session
 from fcslam.cloud.settings import FleetConfig, FusionStrategy
-from fcslam.cloud.stage_times import StageTimes
 from fcslam.cloud.tags import SeenTags
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
-from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
-from fcslam.lidar.verification import Verification, VerificationConfig
+from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
     Change,
@@ -80,12 +78,10 @@ class Fleet:
         self._verify_pairs = verify_pairs
         self._seed = seed
         self._sessions = SessionStore(config.claims, read)
-        self.stages = StageTimes()
-        """Times of verification and of solves, since this fleet was made."""
-        self._graph = JointGraph(self.stages)
+        self._graph = JointGraph()
         self._decisions = ClosureDecisions(config, self._sessions, self._graph)
         self._recognition = PlaceRecognition(
-            config, seed, self._sessions, self._graph, self._decisions.closures, self._timed(verify_pairs)
+            config, seed, self._sessions, self._graph, self._decisions.closures, verify_pairs
         )
         self._tags = SeenTags(self._sessions, self._graph)
         self._quality = CorrectionQuality(self._graph)
@@ -128,15 +124,6 @@ class Fleet:
                 self._sessions.add_fix(fix)
             case Correction() | Acknowledgement() | DetectorUpdate():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
-
-    def _timed(self, verify_pairs: VerifyPairs) -> VerifyPairs:
-        def verify(pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
-            if not pairs:
-                return []
-            with self.stages.measure("verification"):
-                return verify_pairs(pairs, config)
-
-        return verify
 
     def state(self) -> State:
         """The state after the packets so far, without what those hold; ``restored`` makes an equal fleet of it."""

@@ -6,7 +6,6 @@ from dataclasses import fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.cloud.stage_times import StageTimes
 from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize
@@ -25,8 +24,7 @@ SOLVED_SHARE = 0.05
 class JointGraph:
     """Grows with the packets; poses of robots in different maps are each in their own map's frame."""
 
-    def __init__(self, stages: StageTimes | None = None) -> None:
-        self.stages = stages or StageTimes()
+    def __init__(self) -> None:
         self.graph = PoseGraph()
         self._factors = FactorCache(self.graph)
         self._variables: dict[str, Rows[np.int64]] = {}
@@ -127,12 +125,11 @@ class JointGraph:
 
     def optimize(self) -> None:
         """Quick solve (Levenberg-Marquardt with a Cauchy loss on closures) of the maps whose closures changed."""
-        with self.stages.measure("solve"):
-            start, kept, edges, changed = self._poses.values, self._kept(), self.graph.arrays(), list(self._changed)
-            component = self.graph.components(kept)
-            solved = np.isin(component, component[np.concatenate((edges.i[changed], edges.j[changed]))])
-            solution = optimize(self.graph, start, loss=Loss.CAUCHY, kept=kept, factors=self._factors, solved=solved)
-            self.take(solution.poses)
+        start, kept, edges, changed = self._poses.values, self._kept(), self.graph.arrays(), list(self._changed)
+        component = self.graph.components(kept)
+        solved = np.isin(component, component[np.concatenate((edges.i[changed], edges.j[changed]))])
+        solution = optimize(self.graph, start, loss=Loss.CAUCHY, kept=kept, factors=self._factors, solved=solved)
+        self.take(solution.poses)
 
     def take(self, poses: FloatArray) -> None:
         """Replace the estimate by a solution, shape (N, 3)."""

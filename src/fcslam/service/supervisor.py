@@ -5,11 +5,9 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from fcslam.cloud.stage_times import StageTotal
 from fcslam.processes import Child, module_command
 
 LONGEST_PAUSE_S = 30.0
@@ -20,8 +18,6 @@ READY = "ready"
 """The event by which a worker reports that it is ready."""
 PROGRESS = "progress"
 """The event by which a worker reports how many packets it has applied."""
-STAGES = "stages"
-"""The event by which a worker reports how often each of its stages ran, and how many seconds it took in all."""
 WORKER = "fcslam.service.worker"
 """The module of workers."""
 STANDBY_WORKERS = 2
@@ -73,8 +69,6 @@ class Supervisor:
         self._is_ready = False
         self.starts, self.applied = 0, 0
         """How often a worker was started, and how many packets the present one has applied."""
-        self.stages: Mapping[str, StageTotal] = {}
-        """Totals of the present worker's stages, by name."""
         self._thread = threading.Thread(target=self._run, name=f"worker of {name}", daemon=True)
         self._thread.start()
 
@@ -124,7 +118,7 @@ class Supervisor:
         child = self._start()
         with self._lock:
             self._child, self._is_ready = child, False
-            self.starts, self.applied, self.stages = self.starts + 1, 0, {}
+            self.starts, self.applied = self.starts + 1, 0
             if self._stopping.is_set():
                 child.stop()
         try:
@@ -140,8 +134,6 @@ class Supervisor:
             self._is_ready = True
         elif event == PROGRESS:
             self.applied = content
-        elif event == STAGES:
-            self.stages = {stage: StageTotal(*total) for stage, total in content.items()}
         else:
             self._listen(event, content)
 
@@ -153,7 +145,6 @@ class Elsewhere(NamedTuple):
     applied: int
     pid: int | None = None
     starts: int = 0
-    stages: Mapping[str, StageTotal] = MappingProxyType({})
 
     def notify(self) -> None:
         """It looks for itself."""

@@ -49,7 +49,7 @@ from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SNAPSHOT, fetch_snapshot, put_file
 from fcslam.service.shared.mission_tables import Lease, LeaseLostError, MissionTables
-from fcslam.service.supervisor import PROGRESS, READY, STAGES, WorkerTask
+from fcslam.service.supervisor import PROGRESS, READY, WorkerTask
 from fcslam.storage.postgres import Postgres
 from fcslam.storage.state_file import code_version, read_state, write_state
 from fcslam.warmup import warm_up_fleet
@@ -193,7 +193,6 @@ class Worker:
         self._report()
         if self._applied > applied:
             self._emit_event(PROGRESS, self._applied)
-            self._emit_event(STAGES, self._host.fleet.stages.totals)
         return self._arrivals > arrivals or self._applied > applied
 
     def _report(self) -> bool:
@@ -282,8 +281,7 @@ class Worker:
             return
         self._crashes.begin(task)
         try:
-            with self._host.fleet.stages.measure("apply"):
-                self._host.apply_next(_number(packet), decode(packet.data))
+            self._host.apply_next(_number(packet), decode(packet.data))
         except PacketError as error:
             self._refuse(packet, str(error))
         except MemoryError:

@@ -11,7 +11,6 @@ import httpx
 import uvicorn
 
 from fcslam.cloud.settings import CloudConfig
-from fcslam.cloud.stage_times import StageTotal
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Channel
 from fcslam.service.audit_log import audit_file
@@ -53,7 +52,6 @@ class InlineWorker:
 
     def __init__(self, folder: MissionFolder) -> None:
         self._now = 0.0
-        self.stages: dict[str, StageTotal] = {}
         self._store = MissionStore(folder.store)
         self._worker = Worker(folder, self._store, lambda: self._now, lambda *_: None, InlineTask)
 

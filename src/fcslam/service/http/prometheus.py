@@ -51,7 +51,7 @@ class ServiceMetrics:
 
     def text(self, mission: OpenMission) -> bytes:
         """All metrics in the Prometheus text format."""
-        families = *self._registry.collect(), *self._gauges(mission), *self._uplink(mission), *_stages(mission)
+        families = *self._registry.collect(), *self._gauges(mission), *self._uplink(mission)
         return generate_latest(cast(Collector, SimpleNamespace(collect=lambda: families)))
 
     def _gauges(self, mission: OpenMission) -> Iterator[Metric]:
@@ -83,14 +83,3 @@ class ServiceMetrics:
                 sizes.add_metric(label, traffic.bytes)
         yield packets
         yield sizes
-
-
-def _stages(mission: OpenMission) -> Iterator[Metric]:
-    """Runs of the present worker's stages and the time they took; they begin again with a new worker."""
-    runs = CounterMetricFamily("fcslam_stage_runs", "Runs of a stage of the worker", labels=("stage",))
-    seconds = CounterMetricFamily("fcslam_stage_seconds", "Time of a stage of the worker", labels=("stage",))
-    for stage, total in sorted(mission.worker.stages.items()):
-        runs.add_metric((stage,), total.runs)
-        seconds.add_metric((stage,), total.seconds)
-    yield runs
-    yield seconds
