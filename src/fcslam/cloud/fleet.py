@@ -6,7 +6,7 @@ evidence may revoke a join. ``finalize`` depends on the set of packets only, not
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 from fcslam.cloud.claims import LONGEST_CLOSURE_M, check_constraint, check_submap, with_least_noise
 from fcslam.cloud.closure_log import ClosureEntry
@@ -43,12 +43,6 @@ from fcslam.records import (
 )
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
-
-
-class _Part(Protocol):
-    def state(self) -> State: ...
-
-    def restore(self, state: State) -> None: ...
 
 
 class _Replayed(NamedTuple):
@@ -129,7 +123,7 @@ class Fleet:
         """The state after the packets so far, without what those hold; ``restored`` makes an equal fleet of it."""
         return {"needs_replay": self._needs_replay, **{name: part.state() for name, part in self._parts().items()}}
 
-    def _parts(self) -> dict[str, "_Part"]:
+    def _parts(self) -> dict[str, Any]:
         return {
             "sessions": self._sessions,
             "graph": self._graph,

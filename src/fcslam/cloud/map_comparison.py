@@ -1,7 +1,8 @@
 """Comparison of the maps of two sessions: exhaustive around the places that match, or where a joint map lays them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from fcslam.graph.evidence import MapFit, refutation
 from fcslam.graph.trajectory import Trajectory
 from fcslam.lidar.map_agreement import LocalSubmap, Noise, PlaceAgreement, compare, local_map, noise_of, total
 from fcslam.lidar.scan import PointScan, keyscan_points
-from fcslam.lidar.submap import Submap, build_submap
+from fcslam.lidar.submap import build_submap
 from fcslam.records import FloatArray, Keyscan, KeyscanId, frozen
 from fcslam.storage.snapshot import Kept
 
@@ -45,19 +46,7 @@ DRIFT_M, DRIFT_RAD = 0.5, 0.1
 """Local maps are aligned within these: farther off, another wall is the nearest one."""
 RIVALS = 2
 """Transforms elsewhere at which local maps are compared: those with the best scores."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Near:
-    scans: Sequence[tuple[PointScan, FloatArray]]
-    """With their poses in the frame of the anchor."""
-    anchor: KeyscanId
-    is_complete: bool
-    """Whether no keyscan around the point was released."""
-
-    def submap(self) -> Submap:
-        """Their map, in the frame of the anchor."""
-        return build_submap(self.scans, REACH_M)
+_NONE = KeyscanId("", -1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,21 +131,20 @@ class MapComparison(Kept):
         # SciPy's transforms take as long to load as a hundred scans, and most missions compare no maps.
         from fcslam.lidar.uniqueness import align_map, alignments
 
-        near_a = self._map_around(sessions[0], a.poses, a.poses[members.i, :2].mean(axis=0))
-        near_b = self._map_around(sessions[1], b.poses, b.poses[members.j, :2].mean(axis=0))
-        keyscans = min(len(near.scans) if near else 0 for near in (near_a, near_b))
-        is_complete = near_a is not None and near_b is not None and near_a.is_complete and near_b.is_complete
-        if earlier and not is_complete and earlier[0].keyscans > keyscans:
+        local_maps = _LocalMaps(self._sessions, sessions, (a.poses, b.poses))
+        near_a, i, is_complete_a = local_maps.around(0, a.poses[members.i, :2].mean(axis=0))
+        near_b, j, is_complete_b = local_maps.around(1, b.poses[members.j, :2].mean(axis=0))
+        keyscans = min(len(near_a), len(near_b))
+        if earlier and not (is_complete_a and is_complete_b) and earlier[0].keyscans > keyscans:
             return replace(earlier[0], closures=len(members), size=len(a) + len(b))
-        if near_a is None or near_b is None:
+        if not keyscans:
             return None
-        i, j = near_a.anchor, near_b.anchor
         T_a_i, T_b_j = a.poses[i.number], b.poses[j.number]
         T_i_j = _between(T_a_i, T_a_b, T_b_j)
-        local_maps = _LocalMaps(self._keyscans_around, self._scans, sessions, (a.poses, b.poses))
         fit = _fit(local_maps.agreement(_transforms(a, b, members)))
         if refutation(fit) is None:  # else no transform elsewhere matters
-            whole_a, whole_b = near_a.submap(), near_b.submap()
+            whole_a = build_submap(local_maps.scans(0, near_a, i.number), REACH_M)
+            whole_b = build_submap(local_maps.scans(1, near_b, j.number), REACH_M)
             best = align_map(whole_a, whole_b, T_i_j)
             fit = replace(fit, seen_m=best.known_m)
             for rival in alignments(whole_a, whole_b, best.T_a_b)[:RIVALS]:
@@ -168,32 +156,7 @@ class MapComparison(Kept):
 
     def at(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> MapFit:
         """Compare the maps of two sessions at poses (N, 3) of their keyscans in the frame of one map."""
-        local_maps = _LocalMaps(self._keyscans_around, self._scans, sessions, (poses_a, poses_b))
-        return _fit(local_maps.agreement(np.zeros_like(poses_b)))
-
-    def _map_around(self, session: str, poses: FloatArray, middle: FloatArray) -> _Near | None:
-        """The session's map around a point (2,) in the frame of the poses (N, 3)."""
-        keyscans = self._keyscans_around(session, poses, middle, REACH_M, MOST_KEYSCANS)
-        if not keyscans:
-            return None
-        distance_m = np.hypot(*(poses[:, :2] - middle).T)
-        is_complete = len(keyscans) >= min(MOST_KEYSCANS, int(np.count_nonzero(distance_m <= REACH_M)))
-        anchor = min((keyscan.id for keyscan in keyscans), key=lambda id_: float(distance_m[id_.number]))
-        return _Near(self._scans(session, keyscans, poses, anchor), anchor, is_complete)
-
-    def _keyscans_around(
-        self, session: str, poses: FloatArray, middle: FloatArray, reach_m: float, most: int
-    ) -> list[Keyscan]:
-        """The keyscans of a session that are left around a point (2,); of many, ``most`` evenly spaced ones."""
-        distance_m = np.hypot(*(poses[:, :2] - middle).T)
-        keyscans = [keyscan for keyscan in self._sessions.keyscans(session) if distance_m[keyscan.id.number] <= reach_m]
-        return [keyscans[row] for row in _at_most(np.arange(len(keyscans)), most)]
-
-    def _scans(
-        self, session: str, keyscans: Sequence[Keyscan], poses: FloatArray, anchor: KeyscanId
-    ) -> list[tuple[PointScan, FloatArray]]:
-        lasers, T_anchor = self._sessions.lasers(session), poses[anchor.number]
-        return [(keyscan_points(k, lasers), se2.between(T_anchor, poses[k.id.number])) for k in keyscans]
+        return _fit(_LocalMaps(self._sessions, sessions, (poses_a, poses_b)).agreement(np.zeros_like(poses_b)))
 
 
 def _fit(agreement: PlaceAgreement) -> MapFit:
@@ -204,18 +167,37 @@ def _fit(agreement: PlaceAgreement) -> MapFit:
 class _LocalMaps:
     """Local maps of two sessions around separate places of the second one's path, which are built once."""
 
-    def __init__(
-        self,
-        keyscans_around: Callable[[str, FloatArray, FloatArray, float, int], list[Keyscan]],
-        scans: Callable[[str, Sequence[Keyscan], FloatArray, KeyscanId], list[tuple[PointScan, FloatArray]]],
-        sessions: tuple[str, str],
-        poses: tuple[FloatArray, FloatArray],
-    ) -> None:
+    def __init__(self, store: SessionStore, sessions: tuple[str, str], poses: tuple[FloatArray, FloatArray]) -> None:
         """``poses`` (N, 3) of both sessions' keyscans, each in its own frame, metres and radians."""
-        self._keyscans_around, self._scans = keyscans_around, scans
-        self._sessions, self._poses = sessions, poses
+        self._store, self._sessions, self._poses = store, sessions, poses
         self._built: dict[tuple[int, int], LocalSubmap | None] = {}
-        self._places = _separate(poses[1], np.arange(len(poses[1])), PLACES_APART_M)
+
+    @cached_property
+    def _places(self) -> NDArray[np.int64]:
+        return _separate(self._poses[1], np.arange(len(self._poses[1])), PLACES_APART_M)
+
+    def around(self, side: int, middle: FloatArray) -> tuple[list[Keyscan], KeyscanId, bool]:
+        """The keyscans of a session that are left around a point (2,), the nearest one, and whether none was released
+        there."""
+        distance_m = self._distance_m(side, middle)
+        keyscans = self._keyscans(side, middle, REACH_M, MOST_KEYSCANS)
+        is_complete = len(keyscans) >= min(MOST_KEYSCANS, int(np.count_nonzero(distance_m <= REACH_M)))
+        nearest = min((k.id for k in keyscans), key=lambda id_: float(distance_m[id_.number]), default=_NONE)
+        return keyscans, nearest, is_complete
+
+    def scans(self, side: int, keyscans: Sequence[Keyscan], anchor: int) -> list[tuple[PointScan, FloatArray]]:
+        """The scans of keyscans, with their poses (3,) in the keyscan ``anchor``."""
+        lasers, poses = self._store.lasers(self._sessions[side]), self._poses[side]
+        return [(keyscan_points(k, lasers), se2.between(poses[anchor], poses[k.id.number])) for k in keyscans]
+
+    def _distance_m(self, side: int, middle: FloatArray) -> FloatArray:
+        distance_m: FloatArray = np.hypot(*(self._poses[side][:, :2] - middle).T)
+        return distance_m
+
+    def _keyscans(self, side: int, middle: FloatArray, reach_m: float, most: int) -> list[Keyscan]:
+        distance_m = self._distance_m(side, middle)
+        near = [k for k in self._store.keyscans(self._sessions[side]) if distance_m[k.id.number] <= reach_m]
+        return [near[row] for row in _at_most(np.arange(len(near)), most)]
 
     def agreement(self, T_a_b: FloatArray) -> PlaceAgreement:
         """Compare the local maps of both sessions wherever the first one was near a place of the second.
@@ -249,9 +231,8 @@ class _LocalMaps:
 
     def _at(self, side: int, row: int) -> LocalSubmap | None:
         if (side, row) not in self._built:
-            session, poses = self._sessions[side], self._poses[side]
-            keyscans = self._keyscans_around(session, poses, poses[row, :2], LOCAL_M, MOST_LOCAL_KEYSCANS)
-            scans = self._scans(session, keyscans, poses, KeyscanId(session, row))
+            keyscans = self._keyscans(side, self._poses[side][row, :2], LOCAL_M, MOST_LOCAL_KEYSCANS)
+            scans = self.scans(side, keyscans, row)
             is_enough = len(scans) >= FEWEST_LOCAL_KEYSCANS
             self._built[side, row] = local_map(scans, LOCAL_RADIUS_M) if is_enough else None
         return self._built[side, row]
