@@ -91,11 +91,7 @@ class LivePlanner:
                 self.tree.add(transform.parent, transform.child, transform.T_parent_child)
 
     def plan(self, now_s: float) -> LivePlan | None:
-        """The plan if enough is known; None to wait for more.
-
-        Raises:
-            InputError: the lasers are not level, or tf cannot tell two apart.
-        """
+        """The plan if enough is known; None to wait for more."""
         self._began = now_s if self._began is None else self._began
         is_late = now_s > self._began + PATIENCE_S
         self._find_odometry(is_late)

@@ -60,9 +60,6 @@ def await_sensors(
     """The topics of the robot's sensors, once they are there; ``settle_s`` later, so that all of them are.
 
     Odometry may also come from tf, which is there early on most robots. So its topic is given more time to appear.
-
-    Raises:
-        InputError: a topic is missing, or of another type.
     """
     end_s = time.monotonic() + timeout_s
     while True:
@@ -96,9 +93,6 @@ class RobotNode:
 
         ``suggest_pose`` takes initial poses, if the robot is one in a finished map. ``change_floor`` takes floors, if
         it maps.
-
-        Raises:
-            InputError: another node publishes what this one would.
         """
         self._network, self._namespace, self._topics = network, namespace, topics
         self._map_topic = resolved(namespace, MAP)

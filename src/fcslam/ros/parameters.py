@@ -29,11 +29,7 @@ class NodeParameters(Settings):
 
 
 def load_parameters(path: Path | None) -> NodeParameters:
-    """The parameters in a file of ROS 2 (``NODE: ros__parameters: ...``), or a plain mapping; None: the default ones.
-
-    Raises:
-        InputError: the file cannot be read, or a parameter is unknown or out of range.
-    """
+    """The parameters in a file of ROS 2 (``NODE: ros__parameters: ...``) or a plain mapping; None: the default ones."""
     if path is None:
         return NodeParameters()
     try:

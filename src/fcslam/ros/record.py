@@ -31,9 +31,6 @@ def record(
 
     The file moves to ``output`` at the end. If it cannot be written to the end, what the disk took is kept beside it,
     but for the last megabyte.
-
-    Raises:
-        InputError: the file cannot be written; the message names the file that is kept.
     """
     inbox = Inbox()
     kinds = {**topics.kinds, CLOCK_TOPIC: CLOCK}

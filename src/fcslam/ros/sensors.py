@@ -53,8 +53,6 @@ STEPS_BACK_FOR_RESTART = 3
 """Number of scans in a row that are far back in time until the clock is taken to have stepped back."""
 _LONGEST_WAIT = 10_000
 """Most first messages that wait for the mounting."""
-_IMAGES_KEPT = 200
-"""Most images among them: they are large, and the first ones show little."""
 
 
 class _Patience:
@@ -92,7 +90,6 @@ class LiveSensors:
         """Stamp of the newest scan that was read."""
         self._topics, self._options, self._notify = topics, options, notify
         self._codec = MessageCodec(ros1=False)
-        self._is_camera_ahead = False
         self._directions: dict[str, int] = {}
         """Directions of the scans of clouds in a full turn, by topic; the first cloud decides."""
         self._frames: dict[str, str] = {}
@@ -112,9 +109,6 @@ class LiveSensors:
         """Read the next message; yields the records that are complete at ``now_s`` of a clock that only grows.
 
         ``received_ns`` is the time of a message without a stamp.
-
-        Raises:
-            InputError: the robot cannot be mapped: its lasers are not level, or tf cannot tell two apart.
         """
         self._counts[topic] += 1
         if topic == self._topics.fixes:
@@ -136,10 +130,10 @@ class LiveSensors:
             self.audit.add(broken, self._counts[topic])
             return
         for item in items:
-            if self._reader is None:
-                self._keep_early(self._counts[topic], item)
-            else:
+            if self._reader is not None:
                 yield from self._read(self._reader, self._counts[topic], item)
+            elif not isinstance(item, ImageMessage):  # images are large, and the first ones show little
+                self._early.append((self._counts[topic], item))
         yield from self.wait(now_s)
 
     def wait(self, now_s: float) -> Iterator[SensorRecord]:
@@ -188,13 +182,6 @@ class LiveSensors:
             self.audit.add(fix, self._counts[topic])
         elif fix is not None:
             yield fix
-
-    def _keep_early(self, number: int, item: Message) -> None:
-        self._early.append((number, item))
-        if isinstance(item, ImageMessage):
-            images = [index for index, (_, each) in enumerate(self._early) if isinstance(each, ImageMessage)]
-            if len(images) > _IMAGES_KEPT:
-                del self._early[images[0]]
 
     def _decoded(self, topic: str, payload: bytes, received_ns: int) -> list[Message]:
         kind = self._topics.kinds[topic]
@@ -268,12 +255,6 @@ class LiveSensors:
                 reader = self._reader = self._new_reader(plan)
             self._plan = plan._replace(rig=plan.rig.widened(item))
         yield from self._recorded(reader.add(number, item))
-        if reader.images_ahead_s and not self._is_camera_ahead:
-            self._is_camera_ahead = True
-            self._notify(
-                f"the clock of {self._topics.camera} is about {reader.images_ahead_s:.1f} s ahead of that of "
-                "the odometry, so its images get an older pose or none; set both clocks by one"
-            )
 
     def _has_stepped_back(self, stamp: float) -> bool:
         newest = self._newest_stamp

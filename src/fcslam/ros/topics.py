@@ -42,10 +42,6 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
 
     Fixes of satellite navigation are those of the topic that is first by name. The topics of tf are the namespace's own
     if there is one, else that of all robots.
-
-    Raises:
-        InputError: a required topic is missing, or a named topic is missing or of another type; the message lists the
-            topics that are there.
     """
     known = published(endpoints)
     every = [Topic(name, kind, 1) for name, kind in known.items()]

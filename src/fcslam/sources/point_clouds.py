@@ -136,9 +136,6 @@ def scan_of_cloud(
 
     If ``motion`` says how ``base`` moves around the stamp of the scan, for a cloud whose directions are in no order,
     each point is moved to where it is seen at the stamp.
-
-    Raises:
-        ValueError: the height of the sensor is not known, and no floor is seen.
     """
     in_base = cloud.points @ mounting.rotation.T + mounting.position_m
     offset_s = float(cloud.times_s.mean()) if len(cloud.times_s) else 0.0

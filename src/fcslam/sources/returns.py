@@ -137,8 +137,10 @@ class RangeSample:
             which: the laser, empty or with a blank before it.
             remedy: what to check if nearly no beam has a return.
         """
-        if len(self._samples) < FEWEST_SCANS:
-            return
+        if len(self._samples) >= FEWEST_SCANS and (problem := self._problem(which, remedy)):
+            raise SourceError(f"{path}: {problem}")
+
+    def _problem(self, which: str, remedy: str) -> str:
         returns = np.concatenate([_returns(one) for one in self._samples])
         beyond = np.concatenate([one.values[_is_beyond(one)] for one in self._samples])
         beams = sum(len(one.values) for one in self._samples)
@@ -149,9 +151,9 @@ class RangeSample:
         different = np.unique(np.concatenate((returns, beyond)))
         is_whole = len(different) >= _FEWEST_VALUES and bool(np.mean(different == np.rint(different)) > _WHOLE)
         if large is beyond and middle < LONGEST_USUAL_M:
-            raise SourceError(
-                f"{path}: half of the ranges{which} are above {middle:g} m, beyond the range_max of {farthest:g} m; "
-                "correct it in the driver and record again"
+            return (
+                f"half of the ranges{which} are above {middle:g} m, beyond the range_max of {farthest:g} m; correct it "
+                "in the driver and record again"
             )
         if middle > LONGEST_USUAL_M and (large is beyond or _is_varied(returns)):
             unit = (
@@ -159,26 +161,27 @@ class RangeSample:
                 if middle > _MILLIMETRES
                 else "centimetres: divide them by 100 (inches: by 39.37)"
             )
-            raise SourceError(
-                f"{path}: half of the ranges{which} are above {middle:g}, too much for metres {limits}; they seem to "
-                f"be {unit}{', or intensities,' * is_whole} and give the recording again"
+            return (
+                f"half of the ranges{which} are above {middle:g}, too much for metres {limits}; they seem to be "
+                f"{unit}{', or intensities,' * is_whole} and give the recording again"
             )
         if _overflows(self._samples):
-            raise SourceError(
-                f"{path}: the ranges{which} go from {returns.max():.2f} m to 0 from one beam to the next, as a counter "
-                "that overflows; let the driver use numbers with more bits and record again"
+            return (
+                f"the ranges{which} go from {returns.max():.2f} m to 0 from one beam to the next, as a counter that "
+                "overflows; let the driver use numbers with more bits and record again"
             )
         if is_whole:
-            raise SourceError(
-                f"{path}: the ranges{which} are whole numbers, such as {different[len(different) // 2]:g}, and no "
-                "distances in metres; check that the driver does not publish intensities in their place"
+            return (
+                f"the ranges{which} are whole numbers, such as {different[len(different) // 2]:g}, and no distances in "
+                "metres; check that the driver does not publish intensities in their place"
             )
         share = len(returns) / max(beams, 1)
         if share < FEWEST_RETURNS:
-            raise SourceError(
-                f"{path}: only {share:.1%} of the beams{which} measure a range {limits} in {len(self._samples)} "
-                f"sampled scans; check that the laser is not covered, {remedy}, and record again"
+            return (
+                f"only {share:.1%} of the beams{which} measure a range {limits} in {len(self._samples)} sampled scans; "
+                f"check that the laser is not covered, {remedy}, and record again"
             )
+        return ""
 
 
 def without(values: Ranges, placeholders: Sequence[float]) -> Ranges:

@@ -165,11 +165,7 @@ class DecodedBag:
         return tree
 
     def read(self, topics: Collection[Topic]) -> Iterator[BagMessage]:
-        """The messages of ``topics`` in the order of recording.
-
-        Raises:
-            SourceError: the bag cannot be read again.
-        """
+        """The messages of ``topics`` in the order of recording."""
         parts, census, rows, tape = self._index
         by_number = {census[topic].number: topic for topic in topics}
         counts: Counter[Topic] = Counter()

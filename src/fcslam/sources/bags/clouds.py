@@ -1,4 +1,4 @@
-"""Point clouds and depth images of a bag or a live robot as scans."""
+"""Point clouds and depth images of a bag or a live robot as scans; invalid messages raise ValueError."""
 
 from typing import Any, Final, NamedTuple
 
@@ -45,11 +45,7 @@ class CloudMessage(NamedTuple):
     cloud: PointCloud
 
     def scan(self, mounting: CloudMounting, band: CloudBand) -> ScanMessage:
-        """The scan in the level frame of the sensor.
-
-        Raises:
-            ValueError: the height of the sensor is not known.
-        """
+        """The scan in the level frame of the sensor."""
         found = scan_of_cloud(self.cloud, mounting, band)
         scan = ScanMessage(
             self.stamp + found.offset_s, self.frame, found.beams, 0.0, FARTHEST_M, found.ranges_m, sweep=found.sweep
@@ -76,11 +72,7 @@ def given_cloud_mounting(pose: GivenPose, frame: str) -> CloudMounting:
 
 
 def cloud_of(content: Any, kind: str, bag_time_ns: int, calibration: Calibration | None = None) -> CloudMessage:
-    """Convert a message of type ``kind``: a point cloud, or a depth image with its calibration.
-
-    Raises:
-        ValueError: it is invalid.
-    """
+    """Convert a message of type ``kind``: a point cloud, or a depth image with its calibration."""
     stamp, frame = header_of(content.header, bag_time_ns)
     if kind == IMAGE:
         return CloudMessage(stamp, frame, PointCloud(_depth_points(content, calibration), np.empty(0)))

@@ -56,11 +56,7 @@ class MessageCodec:
         self.store = typestore(ros1)
 
     def decode(self, payload: bytes, kind: str) -> Any:
-        """Decode a message to an object of rosbags.
-
-        Raises:
-            ValueError: the bytes are not a message of this kind.
-        """
+        """Decode a message to an object of rosbags."""
         name = full_name(kind)
         try:
             if self.ros1:

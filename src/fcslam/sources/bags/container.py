@@ -75,11 +75,7 @@ class BagPart:
     """One file of a bag."""
 
     def __init__(self, path: Path) -> None:
-        """Look at the first bytes of the file; one that is compressed by zstd is unpacked.
-
-        Raises:
-            SourceError: it cannot be read, or it is not a bag.
-        """
+        """Look at the first bytes of the file; one that is compressed by zstd is unpacked."""
         self.path = path
         with translate_errors(path):
             if (path.parent / _METADATA).is_file():  # a bag from somebody else
@@ -133,11 +129,7 @@ class BagPart:
 
 
 def open_parts(path: Path) -> tuple[BagPart, ...]:
-    """The files of a bag.
-
-    Raises:
-        SourceError: they are not files of one bag.
-    """
+    """The files of a bag."""
     paths = parts_of(path)
     if len({each.resolve() for each in paths}) < len(paths):
         raise SourceError(f"{path}: a file is given twice; give each part of the recording once")

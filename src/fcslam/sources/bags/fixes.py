@@ -33,9 +33,6 @@ def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str)
     """Convert a message; None if it states that there is no fix.
 
     Latitude and longitude 0 are a fault: the receiver has no fix, and does not say so.
-
-    Raises:
-        ValueError: a number is out of range.
     """
     if content.status.status <= _NO_FIX:
         return None

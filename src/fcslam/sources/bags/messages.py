@@ -72,12 +72,7 @@ class StampedTransform(NamedTuple):
 
 
 def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
-    """Convert a laser scan, or the first echoes of one with several; clockwise beams are reversed.
-
-    Raises:
-        BeamsError: the number of ranges is not the one that the angles say, or there is no field of view.
-        ValueError: the message is invalid otherwise.
-    """
+    """Convert a laser scan, or the first echoes of one with several; clockwise beams are reversed."""
     ranges = _first_echoes(content.ranges)
     count = len(ranges)
     first_rad, increment_rad = _angle_rad(content.angle_min), _angle_rad(content.angle_increment)

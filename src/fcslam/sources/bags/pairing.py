@@ -83,8 +83,6 @@ class OdometryPairing:
         self._updates = OdometryUpdates()
         self._late = 0
         """Newest readings in a row that are earlier than the newest one in time."""
-        self.images_ahead_s = 0.0
-        """By how much the newest image that held a scan was ahead of the odometry; 0 without one."""
 
     @property
     def waiting(self) -> int:
@@ -127,11 +125,8 @@ class OdometryPairing:
         first = self._queue[0].item
         if not isinstance(first, ImageMessage) or not self._readings:
             return False
-        ahead_s = first.stamp - self._readings[-1].stamp
-        if ahead_s <= _AHEAD_S or not any(each.match and isinstance(each.item, ScanMessage) for each in self._queue):
-            return False
-        self.images_ahead_s = ahead_s
-        return True
+        is_ahead = first.stamp - self._readings[-1].stamp > _AHEAD_S
+        return is_ahead and any(each.match and isinstance(each.item, ScanMessage) for each in self._queue)
 
     def flush(self) -> Iterator[tuple[int, Entry]]:
         """Yield all that wait, as no odometry comes any more."""

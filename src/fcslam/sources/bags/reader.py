@@ -66,11 +66,6 @@ class SensorReader:
         """Whether scans or images wait."""
         return self._pairing is not None and self._pairing.waiting > 0
 
-    @property
-    def images_ahead_s(self) -> float:
-        """By how much the clock of the camera is ahead of that of the odometry; 0 if no scan waited for it."""
-        return 0.0 if self._pairing is None else self._pairing.images_ahead_s
-
     def skip_lasers(self) -> Iterator[Numbered]:
         """Wait no longer for the silent lasers, until they send again."""
         yield from self._posed(self._merger.give_up())

@@ -107,13 +107,7 @@ def rig_of(
 def mountings_of(
     sensors: Sequence[MountedSensor], tree: TransformTree, base_frame: str, poses: Sequence[GivenPose]
 ) -> list[Mounting]:
-    """Where the sensors sit: where the user says, or else where tf says.
-
-    Raises:
-        UnknownMountingError: tf does not say it.
-        MountingError: a laser does not look along the floor, or is not on the robot, or two topics have one frame, so
-            tf cannot give the pose of each laser.
-    """
+    """Where the sensors sit: where the user says, or else where tf says."""
     if poses:
         return [
             Mounting((x, y, theta), upside_down=any(upside_down) and sensor.kind in LASER_SCANS, tilt_rad=0.0)

@@ -66,11 +66,7 @@ class _Member:
 
 
 def robots_of(bag: DecodedBag, options: BagOptions) -> tuple[BagRobot, ...]:
-    """The robots of a bag, or those that have the topics that ``options`` name; one or more, by name.
-
-    Raises:
-        SourceError: the bag cannot be read, or its frames do not say which robot the scans of a topic are of.
-    """
+    """The robots of a bag, or those that have the topics that ``options`` name; one or more, by name."""
     heard = tuple(topic for topic in bag.topics if topic.message_count)
     members, spaces = _members(heard, bag)
     labels = {(_prefix(member.frame), member.space) for member in members}

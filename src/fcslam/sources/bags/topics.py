@@ -83,9 +83,6 @@ def choose_topics(
       echo a beam, the name ``scan``, most messages, first by name;
     - odometry: the name ``odom``, most messages, first by name; ground truth only if the user names it;
     - camera: calibrated, most messages, compressed images, first by name.
-
-    Raises:
-        SourceError: a required topic is missing, or a named topic is missing or of another type.
     """
     heard, scans = known.heard, _scans(known)
     if not scans and not options.scan_topics:

@@ -98,11 +98,7 @@ class TransformTree:
         return frame in self._parents or any(parent == frame for parent, _ in self.links)
 
     def fixed(self, base: str, frame: str) -> Transform:
-        """``T_base_frame`` along the shortest way.
-
-        Raises:
-            NoTransformError: the frames are not connected, or one moves against the other.
-        """
+        """``T_base_frame`` along the shortest way."""
         way = self._way(base, frame, is_fixed_only=True)
         if way is None:
             moving = self._way(base, frame, is_fixed_only=False)
