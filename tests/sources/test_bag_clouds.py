@@ -122,22 +122,6 @@ def test_laser_scans_are_preferred_unless_the_cloud_is_named(tmp_path):
     assert any("the scans of /points are its nearest points from 0.1 m to 0.6 m" in note for note in named.notes)
 
 
-def test_a_robot_may_carry_one_of_each(tmp_path):
-    laser = tf(START, "base_link", "laser", (0.2, 0.0, 0.3), topic="/tf_static")
-    optical = tf(START, "base_link", "depth_optical_frame", (0.0, 0.0, 0.3), OPTICAL_XYZW, topic="/tf_static")
-    image, info = depth_image(START, "32FC1")
-    messages = [*drive(), laser, optical, said("/depth/camera_info", START, info, INFO)]
-    for t in np.arange(0.1, 2.0, 0.1):
-        image.header = header(ROS2, START + t, "depth_optical_frame")
-        messages += [said("/depth/image", START + t, image, IMAGE), scan(START + t, np.full(8, 2.0))]
-    path = save(tmp_path / "each.mcap", messages)
-    source = open_source(path, BagOptions(scan_topics=("/points", "/scan", "/depth/image")))
-    assert [laser.beam_count for laser in source.survey().lasers] == [720, 8, 720]
-    assert [laser.T_base_laser[0] for laser in source.survey().lasers] == pytest.approx([0.1, 0.2, 0.0])
-    mountings = [record.laser.T_base_laser for record in source.records() if isinstance(record, LaserScan)]
-    assert [mountings.count(laser.T_base_laser) for laser in source.survey().lasers] == [19, 19, 19]
-
-
 def test_a_cloud_without_a_mounting_is_refused_in_one_line(tmp_path):
     path = save(tmp_path / "bare.mcap", [each for each in drive() if each.topic != "/tf_static"])
     with pytest.raises(SourceError, match=r"no transform from 'base_link' to 'lidar'.*--sensors laser-pose") as refused:

@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from fcslam.errors import InputError, SourceError
 from fcslam.records import LaserModel, LaserScan, Odometry, Sweep, frozen
 from fcslam.sources import open_source, write_bag
-from tests.sources.bag_messages import BEAMS, ROS1, ROS2, drive, save
+from tests.sources.bag_messages import ROS1, ROS2, drive, save
 from tests.sources.carmen_text import pose_at
 
 pytestmark = pytest.mark.slow
@@ -158,17 +158,6 @@ def test_others_read_it(tmp_path, name):
     odometry = next(message for topic, _, message in messages if topic == "/odom")
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_link")
     assert scans[0].angle_max == pytest.approx(math.pi - math.tau / 12, abs=1e-6)
-
-
-def test_a_bag_of_a_bag_has_no_more_messages(tmp_path):
-    source = open_source(save(tmp_path / "run.bag", drive(20)))
-    counts = []
-    for name in ("once.bag", "twice.bag"):
-        write_bag(tmp_path / name, source.records())
-        source = open_source(tmp_path / name)
-        counts.append(sum(1 for _ in source.records()))
-    assert counts[0] == counts[1]
-    assert source.survey().lasers[0].beam_count == BEAMS
 
 
 def test_a_file_is_replaced_when_the_new_one_is_complete(tmp_path):

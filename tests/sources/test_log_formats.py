@@ -12,7 +12,7 @@ from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.records import LaserScan, Odometry
 from fcslam.sources import Fault, FaultCount, ScanRange, open_source
-from fcslam.sources.logs import textlog
+from fcslam.sources.logs.textlog import TextLog
 from tests.sources.carmen_text import BEAMS, drive, flaser, odom, only_scans, pose_at, robotlaser, save, scans_of
 
 
@@ -186,12 +186,11 @@ def test_two_ranges_make_the_whole(tmp_path, cut):
     ]
 
 
-def test_a_short_log_is_parsed_once_and_a_long_one_in_each_pass_with_the_same_result(tmp_path, monkeypatch):
+def test_a_short_log_is_parsed_once_and_a_long_one_in_each_pass_with_the_same_result(tmp_path):
     lines = drive(10)
     path = save(tmp_path / "run.log", [*lines[:9], "FLASER damaged", *lines[9:]])
-    short, long = open_source(path), open_source(path)
+    short, long = open_source(path), TextLog(path, "run", kept_bytes=500)
     survey = short.survey()
-    monkeypatch.setattr(textlog, "KEPT_BYTES", 500)
     assert long.survey() == survey
     path.rename(tmp_path / "away.log")
     kept = list(short.records())
@@ -208,11 +207,9 @@ def test_a_short_log_is_parsed_once_and_a_long_one_in_each_pass_with_the_same_re
 
 
 @pytest.mark.slow
-def test_memory_does_not_depend_on_the_length(tmp_path, monkeypatch):
-    monkeypatch.setattr(textlog, "KEPT_BYTES", 50_000)
-
+def test_memory_does_not_depend_on_the_length(tmp_path):
     def peak_bytes(scans):
-        source = open_source(save(tmp_path / f"{scans}.log", drive(scans, beams=90)))
+        source = TextLog(save(tmp_path / f"{scans}.log", drive(scans, beams=90)), "run", kept_bytes=50_000)
         tracemalloc.start()
         source.survey()
         for _ in source.records():

@@ -95,13 +95,6 @@ def test_the_returns_of_a_sparse_scanner_are_neighbours(columns, directions, clo
     assert point_scan(scan.raw_ranges_m, laser).normals.any(axis=1).mean() > 0.8
 
 
-def test_few_returns_do_not_tell_the_directions_of_a_scanner():
-    few = cloud_of(cloud(STAMP, spinning(at_rest, columns=40), VELODYNE), POINT_CLOUD, 0).cloud
-    dense = cloud_of(cloud(STAMP, spinning(at_rest), VELODYNE), POINT_CLOUD, 0).cloud
-    assert directions_in([few], mounting()) == directions_in([], mounting()) == DIRECTIONS
-    assert directions_in([few, dense, dense], mounting()) == DIRECTIONS
-
-
 @pytest.mark.parametrize("directions", [DIRECTIONS, DIRECTIONS // 2])
 def test_the_body_is_measured_whichever_direction_a_scan_begins_with(directions):
     sample, spacing = BodySample(), math.tau / directions

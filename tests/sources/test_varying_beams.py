@@ -118,16 +118,6 @@ def test_one_range_more_or_less_than_the_angles_say(tmp_path):
     assert source.faults.counts.keys() <= {Fault.REPEATED_SCAN}, "the ranges are all alike"
 
 
-def test_a_scan_of_100_ranges_is_never_one_of_a_laser_with_360(tmp_path):
-    said = [mounted(), *(odom(100 + k, pose_at(k)) for k in range(9))]
-    for k in range(9):
-        count = 100 if k % 3 == 2 else 360
-        said.append(scan(100 + k, (1.0,) * count, angle_min=-math.pi, angle_increment=math.tau / count))
-    source = open_source(save_bag(tmp_path / "run.bag", said))
-    assert [len(scan.ranges_m) for scan in scans_of(source)] == [360] * 6
-    assert source.faults[Fault.OTHER_BEAMS] == FaultCount(3, 3)
-
-
 # Several lasers
 
 

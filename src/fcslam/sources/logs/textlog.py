@@ -44,8 +44,7 @@ from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 KEPT_BYTES = 1 << 25
-"""A log with more bytes is decompressed and parsed again in each pass, so that memory does not grow with its length."""
-
+"""So that memory does not grow with the length of a log."""
 
 NumberedLine = tuple[int, Line | None]
 """A line with its number, counted from 1; None if it is broken."""
@@ -74,8 +73,9 @@ class _Scan(NamedTuple):
 class TextLog:
     """A log with one message per line, compressed or not."""
 
-    def __init__(self, path: Path, name: str) -> None:
-        self.name = name
+    def __init__(self, path: Path, name: str, kept_bytes: int = KEPT_BYTES) -> None:
+        """A log with more than ``kept_bytes`` is decompressed and parsed again in each pass."""
+        self.name, self._kept_bytes = name, kept_bytes
         self._path = path
         self._audit = Audit()
         self._kept: list[NumberedLine] = []
@@ -198,10 +198,10 @@ class TextLog:
             except ValueError:
                 line = None
             size += len(text)
-            if size <= KEPT_BYTES:
+            if size <= self._kept_bytes:
                 kept.append((number, line))
             yield number, line
-        if size <= KEPT_BYTES:
+        if size <= self._kept_bytes:
             self._kept = kept
 
     def _entries(
