@@ -59,7 +59,7 @@ from fcslam.geometry import se2
 from fcslam.lab.simulation.options import Lighting
 from fcslam.lab.simulation.recording import prepare_fleet_folder, record_robot
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
-from fcslam.learning.code_batches import MOST_POINTS, RevisitExamples, RevisitPair
+from fcslam.learning.code_batches import STEP_POINTS, RevisitExamples, RevisitPair
 from fcslam.learning.code_training import CodeInputs, train_codes
 from fcslam.learning.export import export_onnx
 from fcslam.learning.federated.client import Client, InProcessFleet, RevisitClient
@@ -278,7 +278,7 @@ def homography_pairs(learner: Learner, seed: int) -> RevisitExamples:
     images, pairs = [], []
     for k in range(len(learner.pairs)):
         example = learner.keyframes[k % len(learner.keyframes)]
-        pair = draw_pair(example, example.image.shape[::-1], MOST_POINTS, 0, rng)
+        pair = draw_pair(example, example.image.shape[::-1], STEP_POINTS, 0, rng)
         first, second = pair.views
         images += [np.round(255.0 * view.image).clip(0, 255).astype(np.uint8) for view in (first, second)]
         nowhere = np.full((int(pair.valid.sum()), 3), np.nan)

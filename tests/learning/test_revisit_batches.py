@@ -1,7 +1,5 @@
 """Batches of points that were seen again, and what the objective asks of their codes."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -10,8 +8,8 @@ from tests.learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.learning.code_batches import (  # noqa: E402
-    MOST_POINTS,
-    REVISIT_IMAGES,
+    STEP_IMAGES,
+    STEP_POINTS,
     RevisitExamples,
     RevisitPair,
     draw_revisits,
@@ -37,10 +35,10 @@ PAIR = RevisitPair((0, 1), (POINTS, POINTS[::-1].copy()), POSITIONS)
 def test_a_batch_holds_pairs_of_views():
     batch = draw_revisits(RevisitExamples(IMAGES, [PAIR]), 1, 5)
     assert batch.images.tolist() == [0, 0, 1, 1]
-    assert batch.points.shape == (REVISIT_IMAGES, MOST_POINTS, 2)
+    assert batch.points.shape == (STEP_IMAGES, STEP_POINTS, 2)
     assert batch.valid.sum(1).tolist() == [40, 40]
     firsts, seconds = batch.points.chunk(2)
-    for k in range(REVISIT_IMAGES // 2):  # the points of a pair stay together, and with their positions
+    for k in range(STEP_IMAGES // 2):  # the points of a pair stay together, and with their positions
         rows = (firsts[k, :40], seconds[k, :40], batch.positions[k, :40])
         both = {(*a, *b, *c) for a, b, c in zip(*(each.tolist() for each in rows), strict=True)}
         wanted = (*PAIR.points, PAIR.positions.astype(np.float32))
@@ -68,7 +66,7 @@ def test_points_of_two_pairs_differ_if_they_are_far_apart_in_the_map_and_of_one_
     assert np.array_equal(found[same], apart[same])
     assert np.array_equal(found[~same], far(places, MIN_NEGATIVE_DISTANCE_M)[~same])
     assert not found[~same].all()  # both pairs show the same points
-    unknown = replace(batch, positions=torch.full_like(batch.positions, torch.nan))
+    unknown = batch._replace(positions=torch.full_like(batch.positions, torch.nan))
     assert not revisit_negatives(unknown).numpy()[~same].any()
 
 
@@ -82,7 +80,7 @@ def test_codes_that_agree_cost_least_and_equal_codes_of_all_points_do_not_pay():
     batch = draw_revisits(RevisitExamples(IMAGES, [PAIR]), 1, 5)
     columns = torch.randn(4, 256, SIZE // 8, SIZE // 8, generator=torch.Generator().manual_seed(1))
     # In a pair of an image with itself, the two codes of a point agree.
-    agreeing = replace(batch, points=batch.points[:2].repeat(2, 1, 1))
+    agreeing = batch._replace(points=batch.points[:2].repeat(2, 1, 1))
     _, good = objective(4.0 * torch.cat((columns[:2], columns[:2])), agreeing)
     _, other = objective(4.0 * columns, agreeing)
     _, collapsed = objective(torch.full_like(columns, 4.0), agreeing)

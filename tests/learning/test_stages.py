@@ -32,8 +32,8 @@ def test_reading_ends_with_the_last_image_that_is_wanted(tmp_path):
         write(tmp_path / "x" / f"{seed}.png", textured(seed))
     files = find_images([tmp_path / "x"])
     for most, count in ((2, 2), (None, 5)):
-        found = read_images(files, most)
-        assert (len(found.images), found.skipped) == (count, 1)
+        images, skipped = read_images(files, most)
+        assert (len(images), skipped) == (count, 1)
 
 
 def teach(folder, name, size=8, seed=0):

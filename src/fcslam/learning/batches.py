@@ -3,8 +3,7 @@
 from collections import deque
 from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -19,19 +18,15 @@ TEACHER_POINTS = 192
 """Most points of the teacher that are used in a pair."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TensorRecord:
-    """A record of tensors."""
-
-    def to(self, device: torch.device) -> Self:
-        """The record on another device."""
-        return replace(
-            self, **{field.name: getattr(self, field.name).to(device, non_blocking=True) for field in fields(self)}
-        )
+Tensors = TypeVar("Tensors", bound=tuple[Tensor, ...])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TrainingBatch(TensorRecord):
+def on_device(tensors: Tensors, device: torch.device) -> Tensors:
+    """A named tuple of tensors on a device."""
+    return type(tensors)(*(each.to(device, non_blocking=True) for each in tensors))
+
+
+class TrainingBatch(NamedTuple):
     """B pairs; the first B images are first views, the others second views."""
 
     images: Tensor

@@ -6,7 +6,7 @@ training started from is the teacher (Li and Hoiem, "Learning without forgetting
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -14,23 +14,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fcslam.features.detector import GreyImage
-from fcslam.learning.batches import TensorRecord
-from fcslam.learning.homography import Size
+from fcslam.learning.homography import BORDER_PX, Size
 from fcslam.learning.labels import Points
 from fcslam.learning.warps import random_change, relight, warp_image
 from fcslam.records import FloatArray
 
-REVISIT_IMAGES: Final = 4
-"""Images in a batch of revisits."""
-MOST_POINTS: Final = 100
-"""Most points of a pair in a batch."""
-
+STEP_IMAGES: Final = 4
+"""Images of revisits in a step, and views for rehearsal."""
+STEP_POINTS: Final = 100
+"""Most points of a pair of revisits in a step, and points of a view, anywhere in it."""
 VIEWS: Final = 128
 """Views that are drawn once for a robot."""
-VIEWS_A_STEP: Final = 4
-POINTS: Final = 100
-"""Points of a view in a step, anywhere in it."""
-_BORDER_PX: Final = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,8 +51,7 @@ class RevisitExamples:
         return bool(self.pairs)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RevisitBatch(TensorRecord):
+class RevisitBatch(NamedTuple):
     """B pairs of views."""
 
     images: Tensor
@@ -72,16 +65,16 @@ class RevisitBatch(TensorRecord):
 
 
 def draw_revisits(examples: RevisitExamples, seed: int, step: int) -> RevisitBatch:
-    """The pairs of a step, with ``REVISIT_IMAGES`` images."""
-    rng = np.random.default_rng([seed, step, REVISIT_IMAGES])
-    pairs = [examples.pairs[k] for k in rng.integers(len(examples.pairs), size=REVISIT_IMAGES // 2)]
+    """The pairs of a step, with ``STEP_IMAGES`` images."""
+    rng = np.random.default_rng([seed, step, STEP_IMAGES])
+    pairs = [examples.pairs[k] for k in rng.integers(len(examples.pairs), size=STEP_IMAGES // 2)]
     firsts, seconds, positions, valid = [], [], [], []
     for pair in pairs:
-        chosen = rng.permutation(len(pair.positions))[:MOST_POINTS]
+        chosen = rng.permutation(len(pair.positions))[:STEP_POINTS]
         firsts.append(_padded(pair.points[0][chosen]))
         seconds.append(_padded(pair.points[1][chosen]))
         positions.append(_padded(pair.positions[chosen]))
-        valid.append(np.arange(MOST_POINTS) < len(chosen))
+        valid.append(np.arange(STEP_POINTS) < len(chosen))
     return RevisitBatch(
         torch.tensor([pair.images[view] for view in (0, 1) for pair in pairs]),
         torch.from_numpy(np.stack(firsts + seconds)),
@@ -91,20 +84,10 @@ def draw_revisits(examples: RevisitExamples, seed: int, step: int) -> RevisitBat
 
 
 def _padded(rows: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Rows (M, D), M at most ``MOST_POINTS``, with zeros below."""
-    padded = np.zeros((MOST_POINTS, rows.shape[1]), np.float32)
+    """Rows (M, D), M at most ``STEP_POINTS``, with zeros below."""
+    padded = np.zeros((STEP_POINTS, rows.shape[1]), np.float32)
     padded[: len(rows)] = rows
     return padded
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RehearsalBatch(TensorRecord):
-    """The views of one step."""
-
-    numbers: Tensor
-    """Numbers of R views, shape (R,)."""
-    points: Tensor
-    """Shape (R, N, 2), pixels."""
 
 
 def draw_views(images: Sequence[GreyImage], seed: int) -> list[GreyImage]:
@@ -121,10 +104,8 @@ def draw_views(images: Sequence[GreyImage], seed: int) -> list[GreyImage]:
     return views
 
 
-def draw_rehearsal(size: Size, seed: int, step: int) -> RehearsalBatch:
-    """The batch of a step, of views of this width and height."""
-    rng = np.random.default_rng([seed, step, VIEWS_A_STEP, VIEWS])
-    points = rng.uniform(_BORDER_PX, np.array(size) - 1.0 - _BORDER_PX, (VIEWS_A_STEP, POINTS, 2))
-    return RehearsalBatch(
-        torch.from_numpy(rng.integers(VIEWS, size=VIEWS_A_STEP)), torch.from_numpy(points.astype(np.float32))
-    )
+def draw_rehearsal(size: Size, seed: int, step: int) -> tuple[Tensor, Tensor]:
+    """Numbers (R,) of the views of a step, and points (R, N, 2) [px] in them; ``size``: their width and height."""
+    rng = np.random.default_rng([seed, step, STEP_IMAGES, VIEWS])
+    points = rng.uniform(BORDER_PX, np.array(size) - 1.0 - BORDER_PX, (STEP_IMAGES, STEP_POINTS, 2))
+    return torch.from_numpy(rng.integers(VIEWS, size=STEP_IMAGES)), torch.from_numpy(points.astype(np.float32))

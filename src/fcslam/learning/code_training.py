@@ -15,6 +15,7 @@ from torch import Tensor
 
 from fcslam.errors import InputError
 from fcslam.features.detector import GreyImage
+from fcslam.learning.batches import on_device
 from fcslam.learning.code_batches import RevisitExamples, draw_rehearsal, draw_revisits, draw_views
 from fcslam.learning.local_training import LocalTrainingPlan, LocalTrainingResult, train_layers
 from fcslam.learning.network import Description, KeypointNetwork, layer_names, network_from_state
@@ -75,12 +76,12 @@ def train_codes(
     size = (revisits.images[0].shape[1], revisits.images[0].shape[0])
 
     def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
-        batch = draw_revisits(revisits, settings.seed, step).to(device)
+        batch = on_device(draw_revisits(revisits, settings.seed, step), device)
         described = _described(known[batch.images], network, before)
         total, losses = revisit_objective(*described, batch)
-        views = draw_rehearsal(size, settings.seed, step).to(device)
-        described = _described(known[len(revisits.images) + views.numbers], network, before)
-        losses["rehearsal"] = rehearsal_loss(*described, views.points)
+        numbers, points = (each.to(device) for each in draw_rehearsal(size, settings.seed, step))
+        described = _described(known[len(revisits.images) + numbers], network, before)
+        losses["rehearsal"] = rehearsal_loss(*described, points)
         return total + REHEARSAL_WEIGHT * losses["rehearsal"], losses
 
     return train_layers(network, network.body.code_layers, losses_of, plan)

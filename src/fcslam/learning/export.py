@@ -19,12 +19,11 @@ from torch import Tensor, nn
 
 from fcslam.errors import writing
 from fcslam.features.detector import NETWORK_FORMAT
+from fcslam.features.network_check import TRIAL_SHAPE
 from fcslam.learning.network import KeypointNetwork
 from fcslam.storage.files import write_file
 
 OPSET: Final = 17
-TRACED_SIZE: Final = (240, 320)
-"""Height and width of the image with which the network is traced [px]; the file takes other sizes too."""
 
 
 class ExportedNetwork(nn.Module):
@@ -59,7 +58,7 @@ def export_onnx(network: KeypointNetwork, path: Path) -> None:
     with _quietly():
         torch.onnx.export(
             ready,
-            (torch.rand(1, 1, *TRACED_SIZE),),
+            (torch.rand(1, 1, *TRIAL_SHAPE),),
             content,
             input_names=["image"],
             output_names=["scores", "logits"],

@@ -5,7 +5,6 @@ that gives a response at every pixel: the network itself, or Harris's measure, t
 """
 
 from collections.abc import Callable
-from typing import Final
 
 import cv2
 import numpy as np
@@ -13,18 +12,13 @@ from numpy.typing import NDArray
 
 from fcslam.features.dense import find_peaks
 from fcslam.features.detector import GreyImage
-from fcslam.learning.homography import inverse
+from fcslam.learning.homography import BORDER_PX, inverse
 from fcslam.learning.labels import Points
 from fcslam.learning.warps import random_change, warp_image
 from fcslam.records import FloatArray
 
 Response = NDArray[np.float32]
 """Shape (height, width): strength of a keypoint at each pixel."""
-
-HARRIS_BLOCK_PX: Final = 4
-HARRIS_K: Final = 0.04
-BORDER_PX: Final = 4
-"""Pixels closer to the border than this are not keypoints."""
 
 
 def adapt(
@@ -47,7 +41,7 @@ def adapt(
 
 def harris(image: GreyImage) -> Response:
     """Square root of Harris's corner measure (Harris and Stephens 1988); the root limits strong contrast."""
-    measure = np.asarray(cv2.cornerHarris(image, HARRIS_BLOCK_PX, 3, HARRIS_K), np.float32)
+    measure = np.asarray(cv2.cornerHarris(image, blockSize=4, ksize=3, k=0.04), np.float32)
     response: Response = np.sqrt(np.maximum(measure, np.float32(0.0)))
     return response
 

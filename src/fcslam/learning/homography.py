@@ -21,7 +21,9 @@ Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
 CORRECT_PX = 3.0
-"""Largest distance of a repeated keypoint."""
+"""Largest distance of a repeated keypoint, and of two detectors' keypoints that are the same point."""
+BORDER_PX = 4
+"""Points closer to the border of an image than this are not used."""
 
 
 def warp(H: FloatArray, points: FloatArray) -> FloatArray:

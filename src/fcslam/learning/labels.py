@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fcslam.errors import InputError, writing
+from fcslam.learning.homography import CORRECT_PX
 from fcslam.storage.state_file import read_state, write_state
 from fcslam.untrusted import read_arrays
 
-SAME_POINT_PX: Final = 3.0
-"""Points of two detectors that are closer than this are the same point."""
 MOST_POINTS: Final = 800
 WORST_QUALITY: Final = 0.1
 """Quality of the last of ``MOST_POINTS`` points; the first has 1."""
@@ -54,7 +53,7 @@ def fuse_keypoints(first: Points, second: Points) -> Labels:
     if min(len(first), len(second)) == 0:
         points, score = np.concatenate((first, second)), np.concatenate(ranks) / 2.0
     else:
-        distances, nearest = cKDTree(second).query(first, distance_upper_bound=SAME_POINT_PX)
+        distances, nearest = cKDTree(second).query(first, distance_upper_bound=CORRECT_PX)
         both = np.isfinite(distances)
         partner = np.where(both, nearest, 0)
         unmatched = np.ones(len(second), np.bool_)
@@ -104,12 +103,12 @@ def read_labels(path: Path, key: int) -> Labels | None:
 
 
 def _suppress(points: Points, score: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Indices of the points that have no better point within ``SAME_POINT_PX``, best first."""
+    """Indices of the points that have no better point within ``CORRECT_PX``, best first."""
     order = np.argsort(-score, kind="stable")
     rank = np.empty(len(points), np.int64)
     rank[order] = np.arange(len(points))
     kept = np.ones(len(points), np.bool_)
-    neighbours = cKDTree(points).query_ball_point(points, SAME_POINT_PX) if len(points) else []
+    neighbours = cKDTree(points).query_ball_point(points, CORRECT_PX) if len(points) else []
     for index in order:
         if kept[index]:
             for other in neighbours[index]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from fcslam.errors import InputError
-from fcslam.learning.batches import batch_stream
+from fcslam.learning.batches import batch_stream, on_device
 from fcslam.learning.network import KeypointNetwork, layer_names, network_from_state
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import TrainingSettings
@@ -70,7 +70,7 @@ def local_training(
     batches = batch_stream(examples, settings, plan.numbers, ahead=2, threads=1)
 
     def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
-        return step_losses(network, next(batches).to(device), settings, step)
+        return step_losses(network, on_device(next(batches), device), settings, step)
 
     with closing(batches):
         return _descended(network, losses_of, plan)

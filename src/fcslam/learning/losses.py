@@ -23,8 +23,8 @@ _FAR = 1e4
 """Distance that excludes a code from the hardest negatives; codes are at most 16 apart."""
 _FAINT = 1e-4
 """Mean square of a keypoint map below which a window counts as empty."""
-_WHOLE = 0.999
-"""Least valid share of a window that counts as valid throughout, up to rounding."""
+WHOLE = 0.999
+"""Least valid share of a window, or of the neighbours of a point, that counts as all of them, up to rounding."""
 
 
 def binary_activation(logits: Tensor) -> Tensor:
@@ -115,7 +115,7 @@ def agreement_loss(first: Tensor, second: Tensor, valid: Tensor) -> Tensor:
         return F.avg_pool2d(values, AGREEMENT_WINDOW_PX, AGREEMENT_WINDOW_PX // 2)
 
     norms = (mean(first.square()) * mean(second.square()) + _FAINT**2).sqrt()
-    return masked_mean(1.0 - mean(first * second) / norms, mean(valid.to(first.dtype)) > _WHOLE)
+    return masked_mean(1.0 - mean(first * second) / norms, mean(valid.to(first.dtype)) > WHOLE)
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:

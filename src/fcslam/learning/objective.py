@@ -1,7 +1,7 @@
 """The objective of a training step: the losses of one batch, and their weighted sum."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,23 +10,19 @@ from torch.nn import functional as F
 from fcslam.features.codes import CODE_BITS
 from fcslam.features.dense import CELL_PX
 from fcslam.learning import losses
-from fcslam.learning.batches import TensorRecord, TrainingBatch
+from fcslam.learning.batches import TrainingBatch
 from fcslam.learning.code_batches import RevisitBatch
 from fcslam.learning.network import Description, Maps, sample_codes
 from fcslam.learning.settings import Encoder, Losses
 
 MIN_NEGATIVE_DISTANCE_PX = 8.0
 """Points closer to a match than this are not negatives, because their codes should be similar."""
-TEACHER_SHARPNESS = 2.0
-"""Logit of a bit per standard deviation of its projection: one standard deviation gives a probability of 88 %."""
+SHARPNESS = 2.0
+"""Log odds of a bit for one standard deviation of a teacher's projection, or for a code's logit of 1: 88 %."""
 MIN_NEGATIVE_DISTANCE_M = 0.3
 """The same in a map, for points in images of two places; positions are some centimetres off."""
-CODE_SHARPNESS = 2.0
-"""Factor from a code's logit to the log odds of its bit, for a trained network and for the one before it."""
 _STILL = 1e-6
 """Least variance by which the change of the keypoints' context is divided."""
-_SEEN = 0.999
-"""Least interpolated visibility of a pixel that counts as visible: all four neighbours are, up to rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +58,7 @@ REHEARSAL_WEIGHT: Final = 4.0
 """Of the loss that keeps the codes of distorted views of a robot's images, so that less is forgotten."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TeacherBits(TensorRecord):
+class TeacherBits(NamedTuple):
     """A fixed projection of a teacher's float descriptors to 256 values whose signs are its bits."""
 
     mean: Tensor
@@ -73,7 +68,7 @@ class TeacherBits(TensorRecord):
 
     def probabilities(self, descriptors: Tensor) -> Tensor:
         """Probability that each bit is 1, shape (..., 256), for descriptors (..., D)."""
-        return torch.sigmoid(TEACHER_SHARPNESS * ((descriptors - self.mean) @ self.projection))
+        return torch.sigmoid(SHARPNESS * ((descriptors - self.mean) @ self.projection))
 
 
 def objective(
@@ -142,7 +137,7 @@ def revisit_objective(
 
 def rehearsal_loss(described: Description, before: Description, points: Tensor) -> Tensor:
     """Cross entropy of the bits at points (R, N, 2) of views against those of the initial network."""
-    logits, wanted = (CODE_SHARPNESS * sample_codes(each.code_logits.float(), points) for each in (described, before))
+    logits, wanted = (SHARPNESS * sample_codes(each.code_logits.float(), points) for each in (described, before))
     everywhere = torch.ones(points.shape[:2], dtype=torch.bool, device=points.device)
     return losses.distillation_loss(logits, torch.sigmoid(wanted), everywhere)
 
@@ -177,7 +172,7 @@ def views_aligned(maps: Tensor, batch: TrainingBatch) -> tuple[Tensor, Tensor, T
     grid = grid.reshape(-1, height, width, 2)
     both = torch.stack((second, seen_second.to(maps.dtype)), dim=1)
     moved, seen = F.grid_sample(both, grid, mode="bilinear", padding_mode="zeros", align_corners=False).unbind(1)
-    return first, moved, seen_first & (seen > _SEEN)
+    return first, moved, seen_first & (seen > losses.WHOLE)
 
 
 def negatives(points: Tensor, valid: Tensor) -> Tensor:

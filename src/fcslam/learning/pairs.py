@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.features.detector import GreyImage
-from fcslam.learning.homography import Mask, Size, inverse, warp
+from fcslam.learning.homography import BORDER_PX, Mask, Size, inverse, warp
 from fcslam.learning.labels import Labels, Teacher
 from fcslam.learning.warps import (
     random_change,
@@ -20,8 +20,6 @@ from fcslam.learning.warps import (
 )
 from fcslam.records import FloatArray
 
-BORDER_PX: Final = 4
-"""Points closer to the border of a view than this are not used."""
 GRID_SHARE: Final = 0.35
 """Share of a pair's points that are drawn anywhere and not at keypoints: every pixel needs a code."""
 SHIFT_SHARE: Final = 0.3

@@ -20,10 +20,9 @@ from fcslam.features.codes import hamming_matrix
 from fcslam.features.detector import GreyImage, ImageFeatures
 from fcslam.features.lidar_depth import LidarView, locate_among, project
 from fcslam.geometry import se2
+from fcslam.learning.homography import BORDER_PX
 from fcslam.records import CameraModel, FloatArray
 
-BORDER_PX: Final = 4.0
-"""Points that are predicted closer to the border of an image count as not shown."""
 SAME_SURFACE_M: Final = 0.15
 """Largest distance, seen from above, between a point and the surface that the other view shows in its direction."""
 SEARCH_PX: Final = 12.0

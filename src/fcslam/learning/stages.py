@@ -17,7 +17,7 @@ import torch
 
 from fcslam.errors import InputError
 from fcslam.features.dense import CELL_PX
-from fcslam.features.detector import GreyImage
+from fcslam.features.detector import GreyImage, OnnxConfig
 from fcslam.learning.artifacts import Curve, Panel, TrainingReport
 from fcslam.learning.export import detector_version
 from fcslam.learning.homographic_adaptation import Response, adapt, harris, peaks
@@ -29,7 +29,6 @@ from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.trainer import PROGRESS_FILE, ExecutionOptions, TrainingProgress, TrainingRun, read_curves
 
-LABEL_NMS_PX: Final = 4.0
 DESCRIPTORS_OF_AN_IMAGE: Final = 32
 """Descriptors of each image to which the projection of a teacher's descriptors is fitted."""
 FEWEST_IMAGES: Final = 2
@@ -38,13 +37,8 @@ StageCallback = Callable[[str, TrainingProgress], None]
 """Called with the name of a stage and its progress."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReadImages:
-    """The usable images of a folder."""
-
-    images: Sequence[tuple[ImageFile, GreyImage]]
-    skipped: int
-    """Number of files that are not images, too small, or have too few corners."""
+FoundImages = tuple[Sequence[tuple[ImageFile, GreyImage]], int]
+"""Usable images, and the number of files that are not images, too small, or have too few corners."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +104,7 @@ def train_detector(
     return run.train(images.train, images.held_out, bits, partial(on_progress, "joint")), images
 
 
-def read_images(files: Sequence[ImageFile], most: int | None = None) -> ReadImages:
+def read_images(files: Sequence[ImageFile], most: int | None = None) -> FoundImages:
     """Read images; ends with the last of the ``most`` ones to train on. None for all."""
     found: list[tuple[ImageFile, GreyImage]] = []
     train = skipped = 0
@@ -128,11 +122,11 @@ def read_images(files: Sequence[ImageFile], most: int | None = None) -> ReadImag
             f"only {train} of {len(files)} image files can be trained on: the others are not images, smaller than "
             "96 px or have too few corners; give more images"
         )
-    return ReadImages(found, skipped)
+    return found, skipped
 
 
 def label_images(
-    found: ReadImages,
+    found: FoundImages,
     cache: Path,
     settings: TrainingSettings,
     labeller: Callable[[GreyImage], Response] | None,
@@ -152,7 +146,8 @@ def label_images(
     train: list[TrainingExample] = []
     held_out: list[TrainingExample] = []
     sizes: set[int] = set()
-    for index, (file, image) in enumerate(found.images):
+    images, skipped = found
+    for index, (file, image) in enumerate(images):
         taught = None
         if teacher is not None:
             taught = read_teacher(teacher / f"{file.name}.npz")
@@ -164,8 +159,8 @@ def label_images(
                 )
         labels = _labels(image, cache / f"{file.name}.state", settings, labeller, taught)
         (held_out if is_held_out(file.name) else train).append(TrainingExample(image, labels, taught))
-        on_progress(TrainingProgress(index + 1, len(found.images), {}))
-    return TrainingImages(train, held_out or train[:1], found.skipped)
+        on_progress(TrainingProgress(index + 1, len(images), {}))
+    return TrainingImages(train, held_out or train[:1], skipped)
 
 
 def _labels(
@@ -186,11 +181,11 @@ def _labels(
     if known is not None:
         return known
     rng = np.random.default_rng([settings.seed, pixels])
-    corners = peaks(adapt(harris, image, settings.label_copies, rng), LABEL_NMS_PX, MOST_POINTS)
+    corners = peaks(adapt(harris, image, settings.label_copies, rng), OnnxConfig().nms_px, MOST_POINTS)
     if teacher is not None:
         others = teacher.keypoints
     elif detector is not None:
-        others = peaks(adapt(detector, image, settings.label_copies, rng), LABEL_NMS_PX, MOST_POINTS)
+        others = peaks(adapt(detector, image, settings.label_copies, rng), OnnxConfig().nms_px, MOST_POINTS)
     else:
         others = corners
     labels = fuse_keypoints(corners, others)

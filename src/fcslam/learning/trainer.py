@@ -16,7 +16,7 @@ from torch import Tensor
 
 from fcslam.errors import InputError, writing
 from fcslam.learning.artifacts import Curve
-from fcslam.learning.batches import batch_stream
+from fcslam.learning.batches import batch_stream, on_device
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import TeacherBits
 from fcslam.learning.pairs import TrainingExample
@@ -109,7 +109,7 @@ class TrainingRun:
         with writing(self.folder, "choose another output folder"):
             self.folder.mkdir(parents=True, exist_ok=True)
         self._resume()
-        bits = None if bits is None else bits.to(self.device)
+        bits = None if bits is None else on_device(bits, self.device)
         views = validation_pairs(held_out, options.validation_pairs)
         metrics: dict[str, float] = {}
         warnings: tuple[str, ...] = ()
@@ -117,7 +117,7 @@ class TrainingRun:
         batches = batch_stream(examples, settings, steps, 4 * options.threads, options.threads)
 
         def losses_of(step: int) -> tuple[Tensor, dict[str, Tensor]]:
-            return step_losses(self.network, next(batches).to(self.device), settings, step, bits)
+            return step_losses(self.network, on_device(next(batches), self.device), settings, step, bits)
 
         self.network.train()
         with closing(batches):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from fcslam.features.codes import CODE_BITS, hamming_matrix, mutual_matches
 from fcslam.features.dense import find_peaks, sample_codes
+from fcslam.features.detector import OnnxConfig
 from fcslam.learning.homography import (
     CORRECT_PX,
     in_common_view,
@@ -24,13 +25,8 @@ from fcslam.records import Codes, FloatArray
 VALIDATION_PAIRS: Final = 24
 VALIDATION_VIEW: Final = (320, 240)
 """Width and height of a view [px]."""
-VALIDATION_POINTS: Final = 16
-"""Points of a validation pair; validation does not use them, but drawing them is part of the random sequence."""
-VALIDATION_SEED: Final = 2026
-NMS_PX: Final = 4.0
-LEAST_SCORE: Final = 0.001
-"""Probability below which a pixel is not a keypoint."""
-MOST_POINTS: Final = 300
+ROBOT: Final = OnnxConfig(least_score=0.001)
+"""Keypoints are found as robots do, but also fainter ones."""
 LEAST_SPREAD_BITS: Final = 0.3 * CODE_BITS
 """Codes of different points that differ in fewer bits on average are collapsing; chance gives a half of all bits."""
 LARGEST_BIAS: Final = 0.25
@@ -42,9 +38,10 @@ def validation_pairs(held_out: Sequence[TrainingExample], most: int = VALIDATION
     pairs = []
     count = min(most, len(held_out))
     for index in range(count):
-        rng = np.random.default_rng([VALIDATION_SEED, index])
+        rng = np.random.default_rng([2026, index])
         example = held_out[index * len(held_out) // count]
-        pairs.append(draw_pair(example, VALIDATION_VIEW, VALIDATION_POINTS, 0, rng))
+        # Validation uses no points of a pair, but drawing 16 of them is part of the random sequence.
+        pairs.append(draw_pair(example, VALIDATION_VIEW, 16, 0, rng))
     return pairs
 
 
@@ -52,7 +49,7 @@ def validation_pairs(held_out: Sequence[TrainingExample], most: int = VALIDATION
 def detect(network: KeypointNetwork, image: Tensor) -> tuple[FloatArray, Codes]:
     """Keypoints (N, 2) [px] of one image (1, 1, H, W), strongest first, and their codes (N, 32)."""
     maps = network(image)
-    points, _ = find_peaks(network.scores(maps)[0].cpu().numpy(), LEAST_SCORE, NMS_PX, MOST_POINTS)
+    points, _ = find_peaks(network.scores(maps)[0].cpu().numpy(), ROBOT.least_score, ROBOT.nms_px, ROBOT.most_features)
     return points.astype(np.float64), sample_codes(maps.code_logits[0].cpu().numpy(), points)
 
 
@@ -90,7 +87,7 @@ def _validate_pair(network: KeypointNetwork, pair: ViewPair, device: torch.devic
     bits = np.unpackbits(first_codes, axis=1)
     pairs = len(first) * (len(first) - 1)
     return {
-        "repeatability": repeatability(first, second, pair.homography, size, MOST_POINTS).repeatability,
+        "repeatability": repeatability(first, second, pair.homography, size, ROBOT.most_features).repeatability,
         "mma_3px": float(matching_accuracy(errors, [CORRECT_PX])[0]),
         "bit_bias": float(np.abs(bits.mean(axis=0) - 0.5).mean()) if len(first) else np.nan,
         "code_spread_bits": float(hamming_matrix(first_codes, first_codes).sum()) / pairs if pairs else np.nan,

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
 from fcslam.learning.federated.fleet_grid import MAX_ROBOTS, ONLINE_S, FleetGrid
-from fcslam.learning.federated.fleet_server import PATH, FleetApp
+from fcslam.learning.federated.fleet_server import PATH, fleet_app
 from fcslam.learning.federated.messages import TrainingReply, TrainingRequest, write_reply
 from fcslam.learning.federated.settings import FederatedSettings
 
@@ -59,43 +59,43 @@ def reply_of(robot):
 
 def test_a_reply_comes_back_to_who_asked(grid):
     with asked(grid, "one") as replies:
-        found = grid.next_request("one")
+        number, _ = grid.next_request("one")
         assert grid.next_request("two") is None
-        assert grid.reply_limit("one", found.number) > 0
-        assert grid.store_reply("one", found.number, reply_of("one"))
+        assert grid.reply_limit("one", number) > 0
+        assert grid.store_reply("one", number, reply_of("one"))
     assert (replies["one"].robot, replies["one"].error) == ("one", "")
     assert grid.next_request("one") is None
 
 
 def test_a_robot_that_starts_again_gets_its_request_again(grid):
     with asked(grid, "one"):
-        found = grid.next_request("one")
-        assert grid.next_request("one") is found
-        grid.store_reply("one", found.number, reply_of("one"))
+        number, _ = grid.next_request("one")
+        assert grid.next_request("one")[0] == number
+        grid.store_reply("one", number, reply_of("one"))
 
 
 def test_only_the_first_reply_counts_and_only_that_of_the_robot_asked(grid):
     with asked(grid, "one") as replies:
-        found = grid.next_request("one")
-        assert not grid.store_reply("two", found.number, reply_of("two"))
-        assert not grid.store_reply("one", found.number + 1, reply_of("one"))
-        assert grid.reply_limit("two", found.number) == 0
-        assert grid.store_reply("one", found.number, reply_of("one"))
-        assert not grid.store_reply("one", found.number, b"\xff")
+        number, _ = grid.next_request("one")
+        assert not grid.store_reply("two", number, reply_of("two"))
+        assert not grid.store_reply("one", number + 1, reply_of("one"))
+        assert grid.reply_limit("two", number) == 0
+        assert grid.store_reply("one", number, reply_of("one"))
+        assert not grid.store_reply("one", number, b"\xff")
     assert replies["one"].error == ""
 
 
 def test_a_reply_that_is_none_becomes_an_error(grid):
     with asked(grid, "one") as replies:
-        assert grid.store_reply("one", grid.next_request("one").number, b"\xff\xff\xff\xff")
+        assert grid.store_reply("one", grid.next_request("one")[0], b"\xff\xff\xff\xff")
     assert replies["one"].error
 
 
 @pytest.mark.attack
 def test_a_reply_beyond_the_limit_is_read_no_further(grid):
     with asked(grid, "one") as replies:
-        found = grid.next_request("one")
-        limit, read, part = grid.reply_limit("one", found.number), 0, bytes(10_000)
+        number, _ = grid.next_request("one")
+        limit, read, part = grid.reply_limit("one", number), 0, bytes(10_000)
 
         async def endless():
             nonlocal read
@@ -104,9 +104,9 @@ def test_a_reply_beyond_the_limit_is_read_no_further(grid):
                 yield part
 
         async def reply():
-            app = FleetApp(grid).asgi()
+            app = fleet_app(grid)
             async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost") as client:
-                return await client.post(PATH.format(robot="one") + f"/reply/{found.number}", content=endless())
+                return await client.post(PATH.format(robot="one") + f"/reply/{number}", content=endless())
 
         answer = asyncio.run(reply())
     assert (answer.status_code, answer.text) == (413, f"a reply of more than {limit} bytes")
@@ -130,7 +130,7 @@ def test_a_request_is_withdrawn_at_the_deadline(grid):
 def test_who_waits_gets_the_replies(grid):
     with asked(grid, "one", "two") as replies:
         for robot in ("one", "two"):
-            grid.store_reply(robot, grid.next_request(robot).number, reply_of(robot))
+            grid.store_reply(robot, grid.next_request(robot)[0], reply_of(robot))
     assert sorted(replies) == ["one", "two"]
 
 

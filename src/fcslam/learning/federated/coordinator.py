@@ -6,22 +6,23 @@ coordinator that was killed continues from its last checkpoint, with the same re
 
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
 from fcslam.errors import InputError
 from fcslam.learning.federated.aggregation import Aggregate, average, next_weights
 from fcslam.learning.federated.checkpoint import CoordinatorState, read_checkpoint, run_id, write_checkpoint
+from fcslam.learning.federated.client import InProcessFleet
 from fcslam.learning.federated.evaluation import EvaluateFn, combined_score, compare, gate
+from fcslam.learning.federated.fleet_grid import FleetGrid
 from fcslam.learning.federated.held_out import Judgement, check_judgement
 from fcslam.learning.federated.messages import (
     PAIRS,
     RoundReplies,
-    TrainingReply,
     TrainingRequest,
     checked_reply,
     collect_updates,
@@ -33,18 +34,8 @@ from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, interpolate_weights, size_bytes
 from fcslam.learning.training_loop import learning_rate
 
-_SAMPLING_SEED: Final = 77
-"""Separates the drawing of robots from other uses of the training seed."""
-
-
-class TrainingFleet(Protocol):
-    """The robots that a coordinator trains with."""
-
-    def robots(self) -> list[str]:
-        """Names of the connected robots, sorted."""
-
-    def ask(self, robots: Collection[str], request: TrainingRequest, deadline_s: float) -> Mapping[str, TrainingReply]:
-        """The replies that arrive within the deadline, by robot."""
+TrainingFleet = InProcessFleet | FleetGrid
+"""The robots that a coordinator trains with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +170,7 @@ class Coordinator:
         settings, least = self._settings, self._settings.minimum_robots
         while len(connected := self._fleet.robots()) < least:
             self._wait_or_fail(f"{len(connected)} robots are there, {least} needed")
-        rng = np.random.default_rng([settings.training.seed, state.rounds_done, _SAMPLING_SEED])
+        rng = np.random.default_rng([settings.training.seed, state.rounds_done, 77])
         chosen = _sample(connected, settings.participation, least, rng)
         # Counted before the request leaves: after a crash nobody could say which updates have left the robots.
         state = replace(state, times_asked=Counter(state.times_asked) + Counter(chosen))

@@ -3,7 +3,6 @@
 import threading
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from math import inf
 from typing import Final
 
@@ -11,21 +10,10 @@ from fcslam.learning.federated.messages import TrainingReply, TrainingRequest, r
 
 ONLINE_S: Final = 60.0
 """A robot that has been silent for longer is gone."""
-MAX_REPLY_RATIO: Final = 2.0
-"""A reply larger than this many times the request is not read."""
 REPLY_OVERHEAD_BYTES: Final = 64 * 1024
-"""Room in a reply beside the weights: names, metrics, shapes."""
+"""A reply that is larger than the request by more than this is not read."""
 MAX_ROBOTS: Final = 1000
 """Robots of a fleet."""
-
-
-@dataclass(frozen=True, slots=True)
-class PendingRequest:
-    """A request that waits for the replies of robots."""
-
-    number: int
-    data: bytes
-    """The serialised request."""
 
 
 class FleetGrid:
@@ -38,7 +26,7 @@ class FleetGrid:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._seen_s: dict[str, float] = {}
-        self._request = PendingRequest(0, b"")
+        self._request = 0, b""
         self._awaited: set[str] = set()
         self._replies: dict[str, TrainingReply] = {}
         self._changed = threading.Condition()
@@ -51,17 +39,17 @@ class FleetGrid:
             self._seen_s[robot] = self._clock()
             return True
 
-    def next_request(self, robot: str) -> PendingRequest | None:
-        """The request that the robot should work on now; None if no request waits."""
+    def next_request(self, robot: str) -> tuple[int, bytes] | None:
+        """Number and bytes of the request that the robot should work on now; None if no request waits."""
         with self._changed:
             return self._request if robot in self._awaited else None
 
     def reply_limit(self, robot: str, number: int) -> int:
         """Largest size of the reply to a request [bytes]; 0 if the robot has no such request."""
         request = self.next_request(robot)
-        if request is None or request.number != number:
+        if request is None or request[0] != number:
             return 0
-        return int(MAX_REPLY_RATIO * len(request.data)) + REPLY_OVERHEAD_BYTES
+        return len(request[1]) + REPLY_OVERHEAD_BYTES
 
     def store_reply(self, robot: str, number: int, data: bytes) -> bool:
         """Take a robot's reply; false if nobody waits for it."""
@@ -87,7 +75,7 @@ class FleetGrid:
         """Replies that arrive within the deadline."""
         data = write_request(request)
         with self._changed:
-            self._request = PendingRequest(self._request.number + 1, data)
+            self._request = self._request[0] + 1, data
             self._awaited, self._replies = set(robots), {}
             self._changed.wait_for(lambda: not self._awaited, min(deadline_s, threading.TIMEOUT_MAX))
             self._awaited = set()
@@ -95,7 +83,7 @@ class FleetGrid:
 
     def _close(self, robot: str, number: int, reply: TrainingReply) -> bool:
         with self._changed:
-            if robot not in self._awaited or self._request.number != number:
+            if robot not in self._awaited or self._request[0] != number:
                 return False
             self._awaited.discard(robot)
             self._replies[robot] = reply

@@ -21,19 +21,16 @@ from fcslam.errors import FcslamError, writing
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.learning.federated.coordinator import RoundRules
 from fcslam.learning.federated.fleet_grid import FleetGrid
-from fcslam.learning.federated.fleet_server import listening
+from fcslam.learning.federated.fleet_server import RETRY_S, listening
 from fcslam.learning.federated.job import FederatedJob, run_job
 from fcslam.learning.federated.rounds import RoundReport
 from fcslam.learning.federated.settings import RELEASE, FleetLearningSettings
-from fcslam.processes import emit_event
+from fcslam.processes import NICENESS, emit_event
 from fcslam.service.supervisor import READY
 from fcslam.storage.files import write_file
 
-NICENESS: Final = 10
 START: Final = "start.onnx"
 """The detector from which training started, in the output folder."""
-WAIT_S: Final = 5.0
-"""Time after which a round is tried again that could not be completed."""
 _log = logging.getLogger("fcslam.learning")
 
 
@@ -50,7 +47,7 @@ def run(data: Path, output: Path, settings: FleetLearningSettings, listener: soc
         if reason not in told:
             told.add(reason)
             _log.info("waiting: %s", reason)
-        time.sleep(WAIT_S)
+        time.sleep(RETRY_S)  # the round is tried again
 
     job = FederatedJob(
         output, settings.federated, _start(data, output), rules=RoundRules(fewest_pairs=settings.fewest_pairs)

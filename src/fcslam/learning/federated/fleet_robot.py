@@ -6,23 +6,17 @@ The client is part of fcslam as it is installed on the robot. A server can send 
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Final, TypeVar
+from typing import TypeVar
 from urllib.parse import quote
 
 import httpx
 
 from fcslam.errors import InputError, UnavailableError
 from fcslam.learning.federated.client import Client, reply_to
-from fcslam.learning.federated.fleet_server import LONG_POLL_S, NUMBER_HEADER
+from fcslam.learning.federated.fleet_server import ANSWER_S, NUMBER_HEADER, RETRY_S
 from fcslam.learning.federated.messages import TrainingReply, printable_line, read_request, write_reply
 from fcslam.wire.http_transport import HttpClient
 from fcslam.wire.keys import NO_CREDENTIALS, Credentials
-
-ANSWER_S: Final = 60.0
-RETRY_S: Final = 3.0
-"""Time between two attempts to reach the server."""
-IDLE_S: Final = 1.0
-"""Time after which a robot that was not ready asks again."""
 
 _T = TypeVar("_T")
 
@@ -37,7 +31,7 @@ class RobotLink(HttpClient):
         super().__init__(url, shown)
         self.robot = robot
         self._path = f"robots/{quote(robot, safe='')}/learning/"
-        self._client.timeout = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)
+        self._client.timeout = httpx.Timeout(ANSWER_S)
 
     def fetch(self) -> tuple[int, bytes] | None:
         """A request with its number; None if no request waits.
@@ -88,7 +82,7 @@ def serve_requests(
 
     while True:
         if not is_ready():
-            sleep(IDLE_S)
+            sleep(RETRY_S)
             continue
         found = retried(link.fetch)
         if found is None:

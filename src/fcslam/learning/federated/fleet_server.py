@@ -35,74 +35,68 @@ MAX_OPEN_REQUESTS: Final = 4
 """Requests of one robot at the same time."""
 MAX_UNWANTED_BYTES: Final = 64 * 2**20
 """A robot that is still sending would not see an answer, so a reply that comes too late is read to here."""
-STOP_S: Final = 5.0
+ANSWER_S: Final = 60.0
+"""Time for the answer to a request."""
+RETRY_S: Final = 3.0
+"""Time after which something is tried again."""
 
 
-class FleetApp:
-    """The operations. Its methods are the handlers."""
+def fleet_app(grid: FleetGrid) -> Starlette:
+    """The operations as an application for an ASGI server."""
+    open_requests: Counter[str] = Counter()
 
-    def __init__(self, grid: FleetGrid) -> None:
-        self._grid = grid
-        self._open: Counter[str] = Counter()
-
-    def asgi(self) -> Starlette:
-        """The application for an ASGI server."""
-        operations = {"next": self._next, "reply/{number:int}": self._reply}
-        routes = [
-            Route(f"{PATH}/{operation}", self._limited(handler), methods=["POST"])
-            for operation, handler in operations.items()
-        ]
-        return Starlette(routes=routes)
-
-    def _limited(
-        self, handler: Callable[[Request, str], Awaitable[Response]]
-    ) -> Callable[[Request], Awaitable[Response]]:
+    def limited(handler: Callable[[Request, str], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
         """The handler, for as many robots as the fleet has room for, and not too many times at once."""
 
         async def handle(request: Request) -> Response:
             robot = request.path_params["robot"]
-            if not self._grid.admits(robot) or self._open[robot] >= MAX_OPEN_REQUESTS:
+            if not grid.admits(robot) or open_requests[robot] >= MAX_OPEN_REQUESTS:
                 return PlainTextResponse("too many robots, or requests of this robot", 429)
-            self._open[robot] += 1
+            open_requests[robot] += 1
             try:
                 return await handler(request, robot)
             except ClientDisconnect:
                 return Response(status_code=400)
             finally:
-                self._open[robot] -= 1
+                open_requests[robot] -= 1
 
         return handle
 
-    async def _next(self, _request: Request, robot: str) -> Response:
+    async def next_request(_request: Request, robot: str) -> Response:
         end = time.monotonic() + LONG_POLL_S
         while time.monotonic() < end:
-            found = self._grid.next_request(robot)
+            found = grid.next_request(robot)
             if found is not None:
-                return Response(found.data, headers={NUMBER_HEADER: str(found.number)})
+                return Response(found[1], headers={NUMBER_HEADER: str(found[0])})
             await asyncio.sleep(POLL_S)
         return Response(status_code=204)
 
-    async def _reply(self, request: Request, robot: str) -> Response:
+    async def reply(request: Request, robot: str) -> Response:
         number = int(request.path_params["number"])
-        limit, size, body = self._grid.reply_limit(robot, number), 0, bytearray()
+        limit, size, body = grid.reply_limit(robot, number), 0, bytearray()
         async for part in request.stream():
             size += len(part)
             if limit:
                 body += part
             if size > (limit or MAX_UNWANTED_BYTES):
                 reason = f"a reply of more than {limit} bytes"
-                self._grid.refuse_reply(robot, number, reason)
+                grid.refuse_reply(robot, number, reason)
                 return PlainTextResponse(reason, 413, headers={"connection": "close"})
-        if limit and await run_in_threadpool(self._grid.store_reply, robot, number, bytes(body)):
+        if limit and await run_in_threadpool(grid.store_reply, robot, number, bytes(body)):
             return Response(status_code=204)
         return PlainTextResponse("nobody waits for this reply", 410)
+
+    operations = {"next": next_request, "reply/{number:int}": reply}
+    return Starlette(
+        routes=[Route(f"{PATH}/{name}", limited(handler), methods=["POST"]) for name, handler in operations.items()]
+    )
 
 
 @contextlib.contextmanager
 def listening(grid: FleetGrid, listener: socket.socket) -> Iterator[None]:
     """Serve the operations in a thread while the block runs."""
     config = uvicorn.Config(
-        FleetApp(grid).asgi(), log_level="critical", lifespan="off", ws="none", timeout_graceful_shutdown=2
+        fleet_app(grid), log_level="critical", lifespan="off", ws="none", timeout_graceful_shutdown=2
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, args=([listener],), name="fleet server", daemon=True)
@@ -111,4 +105,4 @@ def listening(grid: FleetGrid, listener: socket.socket) -> Iterator[None]:
         yield
     finally:
         server.should_exit = True
-        thread.join(STOP_S)
+        thread.join()

@@ -14,7 +14,7 @@ from fcslam.errors import InputError, writing
 from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage, network_file
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network, weights_version
-from fcslam.learning.federated.weights import Weights
+from fcslam.learning.federated.weights import BATCH_NORM_EPSILON, Weights
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.settings import Encoder
 from fcslam.learning.trainer import CHECKPOINT_FORMAT
@@ -23,10 +23,8 @@ from fcslam.storage.state_file import State, read_state, write_state
 SUFFIX: Final = ".onnx"
 GROUPS: Final = ("best", "average")
 """Trained weights in checkpoints of federated and of central training."""
-UNIT_VARIANCE: Final = 1.0 - 1e-5
-"""With this variance batch normalisation, which adds 1e-5 to it, does not scale."""
 MIN_DEVIATION: Final = 2.0**-8
-"""Standard deviation assumed for a constant channel; its square must exceed the 1e-5."""
+"""Standard deviation assumed for a constant channel; its square must exceed ``BATCH_NORM_EPSILON``."""
 STATISTICS_IMAGES: Final = 64
 
 
@@ -127,7 +125,7 @@ def _unfold(
         f"{norm}.weight": ones,
         f"{norm}.bias": bias[0],
         f"{norm}.running_mean": np.zeros_like(ones),
-        f"{norm}.running_var": UNIT_VARIANCE * ones,
+        f"{norm}.running_var": (1.0 - BATCH_NORM_EPSILON) * ones,  # with which normalisation does not scale
     }
 
 

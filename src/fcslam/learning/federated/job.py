@@ -39,7 +39,6 @@ SHOWN_METRICS: Final = {
 }
 SHOWN_LOSSES: Final = ("detector", "contrastive", "triplet")
 TRAFFIC: Final = {"bytes_down": "to the robots", "bytes_up": "from the robots"}
-MEGABYTE: Final = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +158,7 @@ def _report(state: CoordinatorState, judged_on: str) -> TrainingReport:
     rounds = [int(row["round"]) for row in rows]
     best = next((row for row in rows if int(row["round"]) == state.best_round), {})
     asked = ", ".join(f"{robot} ({times})" for robot, times in sorted(state.times_asked.items()))
-    sent = {label: [each / MEGABYTE for each in accumulate(_column(rows, name))] for name, label in TRAFFIC.items()}
+    sent = {label: [each / 1e6 for each in accumulate(_column(rows, name))] for name, label in TRAFFIC.items()}
     facts = [
         f"Trained by {len(state.times_asked)} robots together, in {state.rounds_done} rounds; this is round "
         f"{state.best_round}. How often each was asked: {asked or 'never'}.",

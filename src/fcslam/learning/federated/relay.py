@@ -1,18 +1,17 @@
 """The routes of a service whose robots learn: requests of its robots go to the process in which the fleet learns."""
 
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import httpx
 from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi import Path as InPath
 
-from fcslam.learning.federated.fleet_server import LONG_POLL_S, NUMBER_HEADER, PATH
+from fcslam.learning.federated.fleet_server import ANSWER_S, NUMBER_HEADER, PATH
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.robots import Name
 from fcslam.service.http.state import ServiceState
 
-ANSWER_S: Final = 60.0
 Operation = Annotated[str, InPath(pattern="^(next|reply/[0-9]{1,18})$")]
 """Nothing else may stand in the path: it would lead to the operations of another robot."""
 
@@ -23,7 +22,6 @@ def learning_router(state: ServiceState, listener: Path) -> APIRouter:
     ``listener`` is the Unix socket of the process in which the fleet learns; only the user of the service can open it.
     """
     router = APIRouter(include_in_schema=False)
-    limits = httpx.Timeout(ANSWER_S, read=LONG_POLL_S + ANSWER_S)
 
     @router.post(f"{PATH}/{{operation:path}}", dependencies=state.require(Role.ROBOT))
     async def learn(request: Request, robot: Name, operation: Operation) -> Response:
@@ -31,7 +29,7 @@ def learning_router(state: ServiceState, listener: Path) -> APIRouter:
         transport = httpx.AsyncHTTPTransport(uds=str(listener), verify=False)
         address = f"http://learning{PATH.format(robot=robot)}/{operation}"
         try:
-            async with httpx.AsyncClient(transport=transport, timeout=limits) as client:
+            async with httpx.AsyncClient(transport=transport, timeout=ANSWER_S) as client:
                 answer = await client.post(address, content=request.stream())
         except httpx.HTTPError as error:
             raise HTTPException(503, "the fleet does not learn now; try again", {"Retry-After": "5"}) from error

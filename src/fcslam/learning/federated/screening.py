@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from fcslam.learning.federated.weights import (
+    BATCH_NORM_EPSILON,
     MEAN,
     VARIANCE,
     FloatVector,
@@ -29,8 +30,6 @@ WORST_CHANNEL: Final = 8.0
 LONGER_THAN_BEFORE: Final = 2.0
 """Factor by which the previous round's length limit exceeds this round's: they grow at the start of training. It holds
 where most of a round's updates are poisoned."""
-BATCH_NORM_EPSILON: Final = 1e-5
-"""Added to variances by batch normalisation."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """Weights of a network as float32 arrays by name, and arithmetic on them."""
 
 from collections.abc import Collection, Mapping
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,8 @@ from numpy.typing import NDArray
 Weights = Mapping[str, NDArray[np.float32]]
 """Arrays by their names in the network, in the network's order; integer counters are left out."""
 FloatVector = NDArray[np.float64]
+BATCH_NORM_EPSILON: Final = 1e-5
+"""Added to variances by batch normalisation."""
 
 MEAN, VARIANCE = "running_mean", "running_var"
 STATISTICS = (MEAN, VARIANCE)
