@@ -27,7 +27,7 @@ FEWEST_MOTIONS: Final = 30
 """Fewer turns and motions say nothing about times and the mounting."""
 FEWEST_PAIRS: Final = 4
 """Fewer turns or motions say nothing about the scales: two numbers are estimated from them."""
-LARGEST_RESIDUAL_M: Final = 0.015
+LARGEST_RESIDUAL_M: Final = 0.1 * LEAST_MOVE_M
 """Motions of scans and odometry that differ by more, as a standard deviation, are not a measure of each other."""
 LARGEST_SIGMA: Final = 0.1
 """The same if the scale of distances is less certain, as a share of it: scans that were lost in a corridor."""

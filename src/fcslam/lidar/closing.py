@@ -25,7 +25,8 @@ from fcslam.records import FloatArray
 
 NARROW_M = 0.8
 """Up to this drift allowance the prediction itself starts the alignment, and the loose gate is enough."""
-DISTANCE_PENALTY, ANGLE_PENALTY = 0.2, 0.1
+DISTANCE_PENALTY = 0.2
+ANGLE_PENALTY = 0.5 * DISTANCE_PENALTY
 """Shares of a search's score that are lost at the edges of its window: of equal poses, the one near the prediction
 counts."""
 UNPACKED = 16
@@ -46,8 +47,8 @@ CONCLUSIVE_SHARE, CONCLUSIVE_M = 0.3, 0.2
 """Such a closure lies within this share of the drift allowance, plus so many metres, of its prediction."""
 MINIMUM_SUPPORT = 3.0
 """Sum of ``Verification.support`` that consistent pending closures need."""
-MINIMUM_SPREAD_M = 3.0
-"""Travel over which they are spread at least: closures from one place are one piece of evidence."""
+MINIMUM_SPREAD_M = MINIMUM_SUPPORT
+"""Travel over which they are spread at least, a metre each: closures from one place are one piece of evidence."""
 LOOP_M, LOOP_PER_M = 0.25, 0.02
 """Two closures are consistent if their loop closes to this many metres, plus so many per metre of path in it."""
 LOOP_RAD, LOOP_RAD_PER_M = BASE_DRIFT_RAD, 0.1 * LOOP_PER_M
@@ -55,17 +56,18 @@ LOOP_RAD, LOOP_RAD_PER_M = BASE_DRIFT_RAD, 0.1 * LOOP_PER_M
 MOST_NEARBY, NEARBY_M = 10, 2.0
 """Most submaps in a square of the map, of this side in metres, that later ones are compared with; beyond, the oldest is
 forgotten."""
-LEAST_GAP_M = 12.0
-"""Least travel between the anchors of two submaps that are compared, metres."""
 SIGHT_M = 8.0
 """Largest distance between the anchors of two submaps that are compared, besides the drift allowance; farther ones
 overlap too little, metres."""
+LEAST_GAP_M = 1.5 * SIGHT_M
+"""Least travel between the anchors of two submaps that are compared, metres."""
 MOST_CANDIDATES = 4
 """Largest number of earlier visits that a submap is compared with; in a square with more than ``MOST_NEARBY``, one
 closure ties it to the well-known area."""
 SIMILAR_PLACES = 6 * MOST_CANDIDATES
 """Most similar earlier submaps among which the places to compare are chosen."""
-DRIFT_M_M, DRIFT_RAD_M = 0.03, 0.006
+DRIFT_M_M = 0.03
+DRIFT_RAD_M = 0.2 * DRIFT_M_M
 """Drift of the position and the heading allowed for, per metre of path through the graph: metres, and radians."""
 WIDEST_M = 15.0
 """Largest half side of the search window, metres."""

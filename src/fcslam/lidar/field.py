@@ -19,7 +19,7 @@ from fcslam.records import FloatArray
 CELL_M: Final = 0.05
 TILE: Final = 16
 """Cells along one side of a tile."""
-REACH_M: Final = 0.5
+REACH_M: Final = 10.0 * CELL_M
 """Cells farther than this from every surfel hold none."""
 MERGE_M: Final = CELL_M
 """A return this close to a surfel that faces the same way is merged into it."""

@@ -14,7 +14,7 @@ from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray
 
-NORMAL_M = 0.1
+NORMAL_M = FREE_CELL_M
 """Width of the Gaussian over free cells whose slope is the normal of a wall."""
 ADJACENT_CELLS = 1.5
 """An occupied cell is part of a surface if a free cell is this near, in cells; what lies behind it is never seen."""

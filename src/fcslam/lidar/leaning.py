@@ -17,7 +17,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.lidar.facing import SCANS_WATCHED, Contradiction, contradicted_facing, part_agreement
-from fcslam.lidar.own_body import MOST_PLACES, NOTHING_M, by_degree, scans_apart
+from fcslam.lidar.own_body import MOST_PLACES, by_degree, scans_apart
 from fcslam.lidar.scan import rays_of
 from fcslam.records import FloatArray, LaserScan, frozen
 from fcslam.sources.returns import FloorLine
@@ -65,7 +65,7 @@ def _line_ahead(scans: Iterable[LaserScan]) -> FloorLine | None:
     if len(places) < FEWEST_PLACES:
         return None
     ranges_m = np.stack([by_degree(scan) for scan in places])
-    ranges_m[ranges_m == NOTHING_M] = np.nan
+    ranges_m[np.isinf(ranges_m)] = np.nan
     is_seen = np.isfinite(ranges_m).mean(axis=0) > LEAST_RETURNS
     ends_m = np.full(360, np.nan)
     ends_m[is_seen] = np.nanquantile(ranges_m[:, is_seen], FARTHEST_SHARE, axis=0)

@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from fcslam.lidar.lost import MOST_SCANS, SETTLED_M
 from fcslam.records import LaserScan
 
 REACH_M: Final = 5.0
@@ -22,9 +23,9 @@ OPENED: Final = 1.15
 """The door opens as the robot sees more than the smallest area by this factor."""
 CLOSED_S: Final = 3.0
 """Least time that the door is closed, seconds."""
-LEAVING_M: Final = 3.0
+LEAVING_M: Final = SETTLED_M
 """Path after which the surroundings of the door are compared, metres."""
-LEAVING_SCANS: Final = 400
+LEAVING_SCANS: Final = 4 * MOST_SCANS
 """Number of scans after which they are compared at the latest."""
 
 

@@ -48,7 +48,8 @@ WALL_M: Final = 0.8
 """Walls of at least this length contradict; shorter things are people, furniture and doors."""
 FEWEST_STRETCHES: Final = 20
 """Of fewer stretches, the noise is taken to be ``NOISE_M``, that of a common laser."""
-NOISE_M, WIDEST_NOISE_M = 0.01, 0.1
+NOISE_M: Final = 0.01
+WIDEST_NOISE_M: Final = 10.0 * NOISE_M
 THROUGH_M: Final = 0.5 * STRETCH_M
 """A wall contradicts where the other map is free at this distance on both of its sides: beams passed through it. At the
 edge of what a robot saw, its free space touches walls that it did not see."""

@@ -29,7 +29,7 @@ ALONG_LIMIT2: Final = 9.0
 DAMPING: Final = 1e-6
 """Added to the diagonal of the normal equations, so that an unconstrained direction stays solvable."""
 SMALL_STEP_M: Final = 2e-4
-SMALL_STEP_RAD: Final = 1e-4
+SMALL_STEP_RAD: Final = 0.5 * SMALL_STEP_M
 """A smaller step means that Gauss-Newton has converged at the present scale of the loss."""
 INLIER_RATIO: Final = 20.0
 """Density of points on their surface relative to that of outliers."""

@@ -15,7 +15,8 @@ from fcslam.records import FloatArray
 
 TAIL: float = 1.0
 """Degrees of freedom of the Student t distribution of the error; few, as wheels may slip."""
-FIRST_MATCHES, LATEST_MATCHES = 20, 200
+FIRST_MATCHES = 20
+LATEST_MATCHES = 10 * FIRST_MATCHES
 """The model counts as many matches as the first number; later matches replace the oldest of the second number."""
 FIRST_TRUST = 0.5
 """Learned scale before the first match: most robots' odometry is better than the model."""

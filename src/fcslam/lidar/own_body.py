@@ -56,11 +56,10 @@ Polygon = Annotated[
 LEAST_MOVE_M, LEAST_TURN_RAD = 2.0 * calibration.LEAST_MOVE_M, 2.0 * calibration.LEAST_TURN_RAD
 """The robot has moved or turned by so much between two scans that are compared."""
 FEWEST_PLACES, MOST_PLACES = 20, 200
-NOTHING_M: Final = 1e3
-"""Range of a degree without a return."""
 SAME_M, STEADY = 0.05, 0.95
 """Largest deviation of a return of the robot from its usual range, and share of the places at which it has it."""
-MARGIN_DEG, LARGEST_GAP_DEG = 1, 3
+MARGIN_DEG = 1
+LARGEST_GAP_DEG = 3 * MARGIN_DEG
 """By how much sectors are wider than what was seen; sectors with a smaller gap are one."""
 SHARPEST: Final = 0.8
 """Length of the mean heading above which a drive does not turn enough: along a corridor, walls stay as they are."""
@@ -107,8 +106,9 @@ def body_sectors(scans: Iterable[LaserScan]) -> Sectors:
         return ()
     ranges_m = np.stack([by_degree(scan) for scan in places])
     middle_m = np.median(ranges_m, axis=0)
-    steady = np.mean(np.abs(ranges_m - middle_m) < SAME_M, axis=0) > STEADY
-    own = np.flatnonzero(steady & (middle_m < LARGEST_BODY_M))
+    near = middle_m < LARGEST_BODY_M
+    steady = np.mean(np.abs(ranges_m[:, near] - middle_m[near]) < SAME_M, axis=0) > STEADY
+    own = np.flatnonzero(near)[steady]
     if not len(own):
         return ()
     parts = np.split(own, np.flatnonzero(np.diff(own) > LARGEST_GAP_DEG) + 1)
@@ -125,10 +125,10 @@ def _sector(first_deg: int, last_deg: int) -> tuple[float, float]:
 
 
 def by_degree(scan: LaserScan) -> FloatArray:
-    """The least range in each degree of the headings in ``base``, shape (360,); ``NOTHING_M`` without one."""
+    """The least range in each degree of the headings in ``base``, shape (360,); infinity without one."""
     is_return = (scan.ranges_m > 0.0) & (scan.ranges_m < scan.laser.max_range_m)
     degree = np.floor(np.remainder(_headings_deg(scan.laser), 360.0)).astype(np.intp) % 360
-    found = np.full(360, NOTHING_M)
+    found = np.full(360, np.inf)
     np.minimum.at(found, degree[is_return], scan.ranges_m[is_return].astype(np.float64))
     return found
 

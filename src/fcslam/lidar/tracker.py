@@ -8,7 +8,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.lidar.correlative import SearchWindow, search
-from fcslam.lidar.evidence import CLEAR, FAR, LEAST_KNOWN, over_steps, resolve
+from fcslam.lidar.evidence import CLEAR, CLEAR_GAIN, FAR, LEAST_KNOWN, over_steps, resolve
 from fcslam.lidar.field import CELL_M, SurfelField
 from fcslam.lidar.matching import FIXED, WIDE_SCALE_M, ScanMatch, match_scan
 from fcslam.lidar.odometry import OdometryError, OdometryModel, OdometryTrust, odometry_error
@@ -19,17 +19,14 @@ from fcslam.sources.contradictions import STILL_M, STILL_RAD
 GOOD_SIGMA = 0.3
 """The points of a good match, by which odometry is judged, fix the position in every direction to this share of
 odometry's error by the model, so that its distance from odometry is the error of odometry. The match is clear, too."""
-SEARCH_GAIN = 3.0
-"""The result of a search replaces a match near odometry only if its log-probability is higher by this: the best of many
-poses explains some points by chance."""
 SEARCH_SIGMA_M = 0.02
 """Limit in metres, for a match that explains the known area: its points must fix the position so well in every
 direction. Along a bare wall the points hardly distinguish poses, and the pattern of the beams favours some.
 """
-LONG_STEP_M, LONG_STEP_RAD, JUMP_SHARE, JUMP_GAIN = 0.3, 0.35, 0.85, 20.0
+LONG_STEP_M, LONG_STEP_RAD, JUMP_SHARE = 0.3, 0.35, 0.85
 """Odometry may jump, as when its driver restarts at zero. After a step so long that the scan contradicts, the robot is
 also looked for where it was. There the scan must show what it did before: so large a share of the points on surfaces,
-and a log-likelihood higher by this."""
+and a log-likelihood higher by twice ``UNLIKELY``."""
 USUAL_WEIGHT, USUAL_STEP = 0.05, 0.1
 """The usual log-likelihood per point follows each match with this weight, and by at most this difference."""
 LARGEST_VELOCITY = 30.0
@@ -56,10 +53,8 @@ SUPPORTED = 0.30
 """Least share of a scan's points on known surfaces; below it, odometry alone gives the pose."""
 DOUBTFUL = 0.75
 """Least share of the points in known area on surfaces; below it, a correlative search starts."""
-SEARCH_RADIUS_M = 1.0
-"""Half side of the window of the correlative search, metres."""
-SEARCH_ANGLE_RAD = 0.5
-"""Half angle of the window of the correlative search, radians."""
+SEARCH_WINDOW = SearchWindow(radius_m=1.0, angle_rad=0.5)
+"""The correlative search after a doubtful match."""
 UNLIKELY = 10.0
 """A match whose log-probability is lower than usual by this starts a correlative search."""
 
@@ -150,7 +145,7 @@ class ScanTracker:
         if match.explained < DOUBTFUL and self._is_long_step(T_local_guess):
             other = self._match(points, thinned, state.T_local_base, error, velocity)
             is_fixed = weakest_sigma_m(other.information) < SEARCH_SIGMA_M
-            is_better = other.log_likelihood > match.log_likelihood + JUMP_GAIN
+            is_better = other.log_likelihood > match.log_likelihood + 2.0 * UNLIKELY
             if is_fixed and is_better and other.explained >= JUMP_SHARE:
                 match, T_local_guess, has_jumped = other, state.T_local_base, True
         if self._odometry.is_measured:  # a prediction was right only as long as the motion went on as before
@@ -256,14 +251,14 @@ class ScanTracker:
         is_unlikely = log_posterior < self._state.usual * len(thinned) - UNLIKELY  # False before the first match
         if not is_doubtful and not is_unlikely:
             return match
-        window = SearchWindow(SEARCH_RADIUS_M, SEARCH_ANGLE_RAD)
-        found = search(points, field, T_local_guess, window, visible_only=True, better_than=match.T_field_base)
+        found = search(points, field, T_local_guess, SEARCH_WINDOW, visible_only=True, better_than=match.T_field_base)
         if np.array_equal(found.T_field_base, match.T_field_base):
             return match
         other = match_scan(thinned, field, found.T_field_base, NO_INFORMATION, velocity)
         other_innovation = se2.motion(T_local_guess, other.T_field_base)
+        # The best of many poses explains some points by chance.
         is_fixed = is_doubtful or weakest_sigma_m(other.information) < SEARCH_SIGMA_M
-        if is_fixed and other.log_likelihood + learned.log_likelihood(other_innovation) > log_posterior + SEARCH_GAIN:
+        if is_fixed and other.log_likelihood + learned.log_likelihood(other_innovation) > log_posterior + CLEAR_GAIN:
             return other
         return match
 
