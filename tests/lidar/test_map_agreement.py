@@ -81,8 +81,3 @@ def test_maps_that_have_nothing_in_common_say_nothing():
 def test_a_map_knows_its_noise():
     quiet, loud = (noise_of([seen(flat(), ROUND, 0, noise_m)]).offset_m for noise_m in (0.002, 0.04))
     assert quiet < NOISE_M < loud
-
-
-def test_sums_add_up():
-    one = compared(seen(flat(), ROUND, 0), seen(flat(), BACK, 1), HERE)
-    assert total([one, one]) == pytest.approx([2.0 * value for value in one])

@@ -3,9 +3,7 @@
 import os
 import pickle
 import signal
-import threading
-import time
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack
 from multiprocessing import get_context
 
@@ -23,40 +21,6 @@ from tests import small_fleet
 from tests.small_fleet import fingerprint, in_order
 
 pytestmark = pytest.mark.slow
-
-
-class LastFirst(Executor):
-    """Runs its tasks in reverse and late; arguments pass as between processes."""
-
-    def __init__(self):
-        self.tasks = []
-        self.wakes = threading.Event()
-        self.ends = False
-        self.thread = threading.Thread(target=self._run, daemon=True)
-        self.thread.start()
-
-    def submit(self, function, *arguments):
-        future = Future()
-        self.tasks.append((future, pickle.dumps((function, arguments))))
-        self.wakes.set()
-        return future
-
-    def _run(self):
-        while self.wakes.wait() and not self.ends:
-            self.wakes.clear()
-            time.sleep(0.005)
-            while self.tasks:
-                future, data = self.tasks.pop()
-                function, arguments = pickle.loads(data)
-                try:
-                    future.set_result(pickle.loads(pickle.dumps(function(*arguments))))
-                except Exception as error:
-                    future.set_exception(error)
-
-    def shutdown(self, **_):
-        self.ends = True
-        self.wakes.set()
-        self.thread.join()
 
 
 class Failing(Executor):
@@ -97,7 +61,7 @@ def pool():
     with ExitStack() as stack:
 
         def make(workers):
-            executors = [stack.enter_context(LastFirst()) for _ in range(workers)]
+            executors = [stack.enter_context(ThreadPoolExecutor(1)) for _ in range(workers)]
             return VerificationPool(lambda: executors, batch=2)
 
         yield make
@@ -172,7 +136,7 @@ def forgets(function, arguments):
 def test_what_a_process_does_not_do_is_done_by_others(pairs, fails, caplog):
     failing, config = Failing(fails), VerificationConfig()
     expected = written(verify_here(pairs, config))
-    with LastFirst() as works:
+    with ThreadPoolExecutor(1) as works:
         verify = VerificationPool(lambda: [failing, works], batch=2, patience_s=0.05)
         for _ in range(3):
             assert written(verify(pairs, config)) == expected
@@ -188,12 +152,6 @@ def test_an_error_of_the_pairs_is_that_of_this_process(pairs, pool):
         verify_here(broken, VerificationConfig())
     with pytest.raises(here.type):
         pool(2)(broken, VerificationConfig())
-
-
-def test_few_pairs_need_no_batch():
-    executor = Failing(gone)
-    assert VerificationPool(lambda: [executor])([], VerificationConfig()) == []
-    assert not executor.asked
 
 
 def test_a_fleet_with_a_pool_is_the_same(packets, pool):

@@ -142,13 +142,6 @@ def test_a_slip_is_found_although_a_wrong_match_explains_what_is_known(slip):
 
 
 @pytest.mark.slow
-def test_without_returns_poses_follow_odometry(truth, odometry):
-    seen = recording(truth[:100], odometry[:100], ring())
-    poses, _ = track([replace(scan, ranges_m=frozen(np.full(360, np.nan), np.float32)) for scan in seen])
-    np.testing.assert_allclose(poses, odometry[:100], atol=1e-9)
-
-
-@pytest.mark.slow
 def test_a_blind_stretch_is_bridged_by_odometry(truth):
     odometry = drifting(truth, np.random.default_rng(2), scale=1.05, veer_rad_m=0.03)
     blind = range(150, 190)

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from fcslam.geometry import se2
 from fcslam.lidar.field import CELL_M, EMPTY, MERGE_M, REACH_M, TABLE, TILE, SurfelField, field_of
 from tests.lidar.worlds import bare_scan, path, ring, ring_drive, room, scan_at
 
@@ -134,13 +133,3 @@ def test_a_compact_field_is_the_same_field():
     empty = field_of([])
     empty.compact()
     assert (empty.nearest(queries) == EMPTY).all()
-
-
-def test_insertion_is_equivariant_in_whole_cells():
-    """A field moved by whole cells holds the same labels."""
-    scan = scan_at((0.3, -0.2, 0.1), room())
-    move = np.array([40 * CELL_M, -24 * CELL_M, 0.0])
-    here, there = SurfelField(np.zeros(2)), SurfelField(move)
-    here.insert(scan, np.zeros(3))
-    there.insert(scan, move)
-    np.testing.assert_allclose(there.points, se2.transform(move, here.points), atol=1e-9)
