@@ -161,7 +161,6 @@ def test_a_fleet_with_a_pool_is_the_same(packets, pool):
         for packet in packets:
             fleet.apply(packet)
         results.append(fingerprint(fleet.conclude()))
-        assert fleet.stages.totals["verification"].seconds > 0.0
     assert results[0] == results[1]
 
 
