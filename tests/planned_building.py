@@ -10,6 +10,7 @@ from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import Keyscan, KeyscanId, LaserModel, frozen
+from tests.lidar.worlds import ranges
 
 WALLS = np.array(
     [
@@ -70,15 +71,8 @@ def true_poses():
 
 
 def ranges_at(pose, walls):
-    """Distance of the nearest wall along each beam, by the intersection of lines."""
-    angles = pose[2] + LASER.angles_rad()
-    d = np.column_stack((np.cos(angles), np.sin(angles)))
-    a, e = walls[:, :2] - pose[:2], walls[:, 2:] - walls[:, :2]
-    cross = d[:, :1] * e[:, 1] - d[:, 1:] * e[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = (a[:, 0] * e[:, 1] - a[:, 1] * e[:, 0]) / cross
-        u = (a[:, 0] * d[:, 1:] - a[:, 1] * d[:, :1]) / cross
-    return np.where((t > 0.0) & (u >= 0.0) & (u <= 1.0), t, np.inf).min(axis=1)
+    """Distance of the nearest wall along each beam."""
+    return ranges(pose, walls, LASER)[0]
 
 
 def mapped(T_map_building=(3.0, -2.0, 0.6), scale=1.0, walls=WALLS, drift_rad=0.0):

@@ -7,8 +7,6 @@ import io
 import re
 import subprocess
 import sys
-import typing
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -59,43 +57,6 @@ def test_the_reference_lists_every_public_name():
     page = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
     listed = {path.rpartition(".")[2] for path in re.findall(r"^::: (\S+)", page, re.MULTILINE)}
     assert listed == {"errors", *fcslam._LAZY}
-
-
-def types_in(annotation):
-    """The classes of fcslam that an annotation names."""
-    if inspect.isclass(annotation) and annotation.__module__.startswith("fcslam."):
-        return {annotation.__name__}
-    parts = annotation if isinstance(annotation, list) else typing.get_args(annotation)
-    return {name for part in parts for name in types_in(part)}
-
-
-def annotated(value):
-    """A public function, or a class with its public methods and properties."""
-    if inspect.isclass(value):
-        members = (member for name, member in inspect.getmembers(value) if name[0] != "_" or name == "__init__")
-        yield from annotated_functions(getattr(member, "fget", member) for member in members)
-        yield value
-    yield from annotated_functions([value])
-
-
-def annotated_functions(values):
-    return (value for value in values if inspect.isfunction(value) and value.__module__.startswith("fcslam."))
-
-
-def test_every_type_of_a_public_signature_or_record_is_public():
-    late = {name: getattr(fcslam, name) for name in fcslam.__all__} | {"Callable": Callable}
-    hints = [
-        hint
-        for value in [getattr(fcslam, name) for name in fcslam.__all__]
-        for one in annotated(value)
-        for name, hint in typing.get_type_hints(one, localns=late).items()
-        if name[0] != "_"
-    ]
-    named = set().union(*map(types_in, hints))
-    sections = {"FleetConfig", "OccupancyConfig", "RobotConfig", "CloudConfig"}
-    filled_in = {"BagCorrection", "BuildingPlan", "Tag", "Wiring"}  # by fcslam itself
-    assert named - sections - filled_in <= set(fcslam.__all__)
-    assert {"Source", "LaserScan", "Anchors"} <= named
 
 
 def test_names_load_their_modules_at_the_first_use():

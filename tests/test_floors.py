@@ -8,7 +8,6 @@ import pytest
 import fcslam
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
-from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import InputError, PacketError, SourceError
 from fcslam.mission.localization import read_map
@@ -16,12 +15,11 @@ from fcslam.mission.mission_file import edit_mission
 from fcslam.records import LaserScan, ManualClosure
 from fcslam.runs import open_run, separations
 from fcslam.sources import open_source
-from fcslam.storage.state_file import read_state, write_state
 from fcslam.wire.messages import Hello
 from tests import small_fleet
 from tests.carmen_logs import write_carmen
 from tests.mission.test_mission_file import contents
-from tests.small_fleet import feed, fingerprint, in_order, map_of
+from tests.small_fleet import feed, in_order, map_of
 
 pytestmark = pytest.mark.slow
 
@@ -44,22 +42,6 @@ def test_only_floors_keep_rooms_apart_that_look_alike(alike, floors, maps):
     assert {robot.robot: robot.floor for robot in result.robots} == dict(zip(("below", "above"), floors, strict=True))
     between = [closure for closure in result.closures if closure.i.robot != closure.j.robot]
     assert bool(between) == (maps == 1)
-
-
-def test_a_fleet_with_floors_goes_on_from_its_state(alike, tmp_path):
-    packets = on_floors(alike, ("1", "2"))
-    stored = {PacketNumber(packet.robot, packet.sequence): packet for packet in packets}
-    fleet, half = Fleet(FleetConfig(), 0), len(packets) // 2
-    for packet in packets[:half]:
-        fleet.apply(packet)
-    write_state(tmp_path / "state", "test", fleet.state())
-    again = Fleet.restored(FleetConfig(), 0, read_state(tmp_path / "state", "test"), stored.__getitem__)
-    for one in (fleet, again):
-        for packet in packets[half:]:
-            one.apply(packet)
-    assert fingerprint(again.conclude()) == fingerprint(fleet.conclude())
-    assert again.vocabularies() == fleet.vocabularies()
-    assert {state.floor for state in again.vocabularies()} == {"1", "2"}
 
 
 def test_a_session_stays_on_its_floor(alike):

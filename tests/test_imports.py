@@ -115,21 +115,6 @@ def test_rooms_import_only_rooms_above():
     assert found == []
 
 
-@pytest.mark.parametrize(
-    ("room", "line", "refused"),
-    [
-        ("geometry/se2.py", "from fcslam import cli", True),
-        ("geometry/se2.py", "def late():\n    from ..lidar.grid import Grid", True),
-        ("graph/g2o.py", "from fcslam.sources import open_source", False),
-        ("learning/trainer.py", "from fcslam.cloud import fleet", True),
-        ("__init__.py", "from fcslam.mission.mission import run", True),
-        ("__init__.py", "if TYPE_CHECKING:\n    from fcslam.mission.mission import run", False),
-    ],
-)
-def test_the_rule_itself(room, line, refused):
-    assert bool(violations(line, Path(room))) is refused
-
-
 def import_graph() -> dict[str, set[str]]:
     """The modules that each module imports, imports inside functions included."""
     paths = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in PACKAGE.rglob("*.py")}

@@ -107,11 +107,8 @@ def read_arrays(path: Path) -> Arrays:
             raise ValueError(f"no archive of arrays: {error}") from error
 
 
-def open_unpacked(path: Path, by_name: bool = False) -> BinaryIO:
-    """Open a file that may be compressed by gzip, xz or bzip2, as its first bytes say, to read what it holds.
-
-    ``by_name``: a file that is named as a compressed one must be one. Reading raises ``LimitError`` beyond the limit.
-    """
+def open_unpacked(path: Path) -> BinaryIO:
+    """Open a file that may be compressed by gzip, xz or bzip2, as its first bytes say, to read what it holds."""
     file = open_file(path)
     magic = file.read(6)
     file.seek(0)
@@ -122,9 +119,6 @@ def open_unpacked(path: Path, by_name: bool = False) -> BinaryIO:
         unpacking = lzma.LZMAFile(file)  # noqa: SIM115  _Limited closes it
     elif magic.startswith(b"BZh"):
         unpacking = bz2.BZ2File(file)
-    elif by_name and path.suffix in (".gz", ".xz", ".bz2"):
-        file.close()
-        raise OSError(f"not a {path.suffix} file")
     else:
         return file
     return cast("BinaryIO", io.BufferedReader(_Limited(unpacking, file, size), _BUFFER_BYTES))

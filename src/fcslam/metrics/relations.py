@@ -177,7 +177,7 @@ def motion_errors(T_true: FloatArray, T_estimated: FloatArray) -> tuple[FloatArr
 def read_relations(path: Path) -> Relations:
     """Read a relations file, plain, ``.gz`` or ``.xz``."""
     try:
-        with open_unpacked(path, by_name=True) as file, io.TextIOWrapper(file, encoding="utf-8") as lines:
+        with open_unpacked(path) as file, io.TextIOWrapper(file, encoding="utf-8") as lines:
             rows = _parse(lines, path)
     except (OSError, EOFError, UnicodeDecodeError, zlib.error, lzma.LZMAError) as error:
         raise InputError(f"{path}: cannot read the relations ({error})") from error
