@@ -1,11 +1,11 @@
-"""Stamps of transforms, and maps of which only the changes are sent."""
+"""Stamps of transforms, and what a robot publishes."""
 
 import numpy as np
 import pytest
 
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import frozen
-from fcslam.ros.outputs import Grid, Outputs, Region, changed_region
+from fcslam.ros.outputs import Outputs
 from fcslam.ros.transform_stream import TransformStream
 from tests.ros.memory_network import MemoryNetwork
 
@@ -34,72 +34,14 @@ def test_a_map_that_stays_the_same_is_sent_once(network, published):
     assert len(network.sent["/robot1/map"]) == 1
 
 
-def test_a_small_map_goes_out_whole(network, published):
+def test_a_map_that_changed_is_sent_again(network, published):
     cells = np.full((4, 5), Occupancy.FREE)
     published.map(1, occupancy(cells))
     cells = cells.copy()
     cells[1, 2] = Occupancy.OCCUPIED
-    published.map(2, occupancy(cells))
+    assert published.map(2, occupancy(cells))
     assert network.sent["/robot1/map"][-1].data.reshape(4, 5)[1, 2] == 100
-    assert not network.sent["/robot1/map_updates"]
-
-
-def test_who_takes_no_updates_gets_their_cells_with_the_next_whole_map(network, published):
-    """As the static layer of Nav2 by default."""
-    cells = np.full((4, 5), Occupancy.FREE)
-    published.map(1, occupancy(cells))
-    cells = cells.copy()
-    cells[1, 2] = Occupancy.OCCUPIED
-    assert published.map(2, occupancy(cells), only_changes=True)
-    assert not published.map(3, occupancy(cells), only_changes=True)
-    assert len(network.sent["/robot1/map"]) == len(network.sent["/robot1/map_updates"]) == 1
-    assert published.map(4, occupancy(cells))
-    assert not published.map(5, occupancy(cells))
-    assert network.sent["/robot1/map"][-1].data.reshape(4, 5)[1, 2] == 100
-    assert len(network.sent["/robot1/map_updates"]) == 1
-
-
-def test_of_a_large_map_what_differs_from_the_last_whole_one_goes_out(network):
-    published = Outputs(network, "/robot1", "map", "/tf", small_map_cells=1)
-    first = np.full((4, 5), Occupancy.UNKNOWN)
-    published.map(1, occupancy(first))
-    second = first.copy()
-    second[1, 2] = Occupancy.OCCUPIED
-    published.map(2, occupancy(second))
-    third = second.copy()
-    third[3, 3] = Occupancy.FREE
-    published.map(3, occupancy(third))
-    assert len(network.sent["/robot1/map"]) == 1
-    update = network.sent["/robot1/map_updates"][-1]
-    assert (update.x, update.y, update.width, update.height) == (2, 1, 2, 3)
-    assert update.data.tolist() == [100, -1, -1, -1, -1, 0]
-    published.map(4, occupancy(third, origin=(-1.0, 0.0)))
-    assert len(network.sent["/robot1/map"]) == 2
-
-
-def test_a_cell_that_changes_back_is_free_at_every_subscriber(network):
-    """A person stands in a large map and walks on, while another part of it changes."""
-    published = Outputs(network, "/robot1", "map", "/tf", small_map_cells=1)
-    cells = [np.full((6, 8), Occupancy.FREE, np.uint8) for _ in range(3)]
-    cells[1][1, 1] = Occupancy.OCCUPIED
-    cells[2][4, 6] = Occupancy.OCCUPIED
-    for stamp, each in enumerate(cells):
-        published.map(stamp, occupancy(each))
-    (whole,) = network.sent["/robot1/map"]
-    early = whole.data.reshape(6, 8).copy()
-    for update in network.sent["/robot1/map_updates"]:
-        rows, columns = slice(update.y, update.y + update.height), slice(update.x, update.x + update.width)
-        early[rows, columns] = update.data.reshape(update.height, update.width)
-    late = whole.data.reshape(6, 8).copy()
-    late[rows, columns] = update.data.reshape(update.height, update.width)
-    assert np.argwhere(early == 100).tolist() == np.argwhere(late == 100).tolist() == [[4, 6]]
-
-
-def test_grids_that_cover_other_cells_have_no_region():
-    grid = Grid(np.zeros((2, 3), np.int8), 0.05, (0.0, 0.0))
-    assert changed_region(grid, grid) == Region(0, 0, 0, 0)
-    assert changed_region(grid, grid._replace(origin_xy=(1.0, 0.0))) is None
-    assert changed_region(grid, grid._replace(values=np.zeros((3, 2), np.int8))) is None
+    assert published.map(3, occupancy(cells, origin=(-1.0, 0.0)))
 
 
 def test_covariance_is_that_of_x_y_and_yaw(network, published):

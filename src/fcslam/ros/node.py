@@ -179,24 +179,14 @@ class RobotNode:
             return
         stamp_ns = self._clock.now_ns() if self._pose is None else nanoseconds(self._pose.stamp)
         own = self._robot.own_map()
-        if self._robot.fleet is None:
-            is_new = self._outputs.map(stamp_ns, own)
-        else:
-            is_new = self._outputs.map(stamp_ns, own, OWN_MAP)
-            if not self.publish_joint_map(only_changes=False):
-                self._outputs.map(stamp_ns, own)
+        joint = None if self._robot.fleet is None or self._pose is None else self._robot.joint_map()
+        is_new = self._outputs.map(stamp_ns, own if joint is None else joint)
+        if self._robot.fleet is not None:
+            is_new |= self._outputs.map(stamp_ns, own, OWN_MAP)
         if is_new or is_finished_map:
             trajectory = self._robot.trajectory()
             self._outputs.path(stamp_ns, trajectory.stamps, trajectory.T_map_base)
             self._outputs.closures(stamp_ns, self._robot.closures())
-
-    def publish_joint_map(self, only_changes: bool) -> bool:
-        """Publish the joint map, if there is one, as ``Outputs.map``; returns whether there is."""
-        joint = self._robot.joint_map()
-        if joint is None or self._pose is None:
-            return False
-        self._outputs.map(nanoseconds(self._pose.stamp), joint, only_changes=only_changes)
-        return True
 
     def _publish_fleet(self) -> None:
         """Publish where the robots of the fleet are, at a fixed rate; frontiers, changes of the robot's map and how
@@ -274,12 +264,10 @@ class RobotNode:
             self.watch_network()
             self.diagnose()
             self._save_maps()
-            is_due = time.monotonic() >= due_s and self.scans != drawn
+            may_be_new = self.scans != drawn or self._robot.fleet is not None  # what the others see comes in between
+            if time.monotonic() < due_s or not may_be_new:
+                continue
             try:
-                if not is_due:
-                    if self._robot.fleet is not None:  # what the others see comes in between
-                        self.publish_joint_map(only_changes=True)
-                    continue
                 drawn, due_s = self.scans, time.monotonic() + self._parameters.map_update_interval
                 self.publish_map()
             except Exception as error:  # this thread also tells the state of the robot, so it must not end

@@ -5,7 +5,6 @@ Frames follow REP 105. The robot publishes ``map -> odom``; the driver of the ba
 
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from math import hypot
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -16,7 +15,7 @@ from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray
 from fcslam.ros.network import Publish, Quality, RosNetwork
 from fcslam.ros.topics import resolved
-from fcslam.sources.bags.codec import GRID_UPDATE, TRANSFORMS, MessageCodec
+from fcslam.sources.bags.codec import TRANSFORMS, MessageCodec
 from fcslam.sources.bags.transforms import in_space
 
 if TYPE_CHECKING:
@@ -30,8 +29,6 @@ POSES, POSE_STAMPED = "geometry_msgs/PoseArray", "geometry_msgs/PoseStamped"
 
 MAP: Final = "map"
 """Topic of the map in the robot's namespace."""
-UPDATES: Final = "_updates"
-"""Ends the topic of the parts of a map that changed."""
 OWN_MAP: Final = "own_map"
 """Topic of what a robot of a fleet saw itself."""
 FLEET_POSES, FLEET_STATUS = "fleet/poses", "fleet/status"
@@ -46,7 +43,6 @@ TRANSFORMED: Final = Quality(reliable=True, depth=100)
 
 _GRID_VALUES: Final = np.array([-1, 0, 100], np.int8)
 """Values of ROS by ``Occupancy``."""
-SMALL_MAP_CELLS: Final = 1_000_000
 PATH_STEP_M: Final = 0.1
 """Least distance between two poses of the published path."""
 LONGEST_PATH: Final = 5000
@@ -66,45 +62,22 @@ class Grid(NamedTuple):
     origin_xy: tuple[float, float]
 
 
-class Region(NamedTuple):
-    """Cells of a grid."""
-
-    x: int
-    y: int
-    width: int
-    height: int
-
-
-@dataclass(slots=True)
-class _Shown:
-    newest: Grid | None = None
-    """The newest map, with its updates."""
-    changed: Region | None = None
-    """Around all cells that changed since a map was published whole; None: nothing did."""
-
-
 class Outputs:
     """The publishers of one robot. Any thread may call."""
 
-    def __init__(
-        self, network: RosNetwork, namespace: str, map_frame: str, tf: str, small_map_cells: int = SMALL_MAP_CELLS
-    ) -> None:
-        """``tf``: topic of the transforms; those without a leading slash are in the namespace.
-
-        Maps of up to ``small_map_cells`` go out whole at every change.
-        """
-        self._small_map_cells = small_map_cells
+    def __init__(self, network: RosNetwork, namespace: str, map_frame: str, tf: str) -> None:
+        """``tf``: topic of the transforms; those without a leading slash are in the namespace."""
         self._network, self._namespace, self._map_frame, self._tf = network, namespace, map_frame, tf
         self._codec = MessageCodec(ros1=False)
         self._lock = threading.Lock()
         self._publishers: dict[str, Publish] = {}
         """By topic; new ones are made under the lock."""
-        self._maps: dict[str, _Shown] = {}
-        """By topic."""
+        self._maps: dict[str, Grid] = {}
+        """The newest map by topic."""
         self._teammates: set[str] = set()
         """Topics of their poses."""
         self._goal_xy: FloatArray = np.full(2, np.nan)
-        self._begin_map(MAP)
+        self._begin(MAP, GRID, LATCHED)
         self._begin("pose", POSE, STREAMED)
         self._begin("path", PATH, LATCHED)
         self._begin("closures", MARKERS, LATCHED)
@@ -189,27 +162,16 @@ class Outputs:
             ]
             self._diagnose(FLEET_QUALITY, now_ns, statuses)
 
-    def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP, only_changes: bool = False) -> bool:
-        """Publish a map if it changed; returns whether it did.
-
-        A small map goes out whole, unless ``only_changes``: the static layer of Nav2 takes no updates by default. Of a
-        large map, all cells that changed since the last whole one go out. So a late subscriber, who gets the whole one,
-        is complete after any update.
-        """
+    def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP) -> bool:
+        """Publish a map if it changed; returns whether it did."""
         grid = Grid(_GRID_VALUES[occupancy.cells], occupancy.resolution_m, occupancy.origin_xy)
         with self._lock:
-            shown = self._begin_map(topic)
-            is_whole = grid.values.size <= self._small_map_cells and not only_changes
-            region = None if shown.newest is None else changed_region(shown.newest, grid)
-            if region is not None and not (region.width or (is_whole and shown.changed)):
+            self._begin(topic, GRID, LATCHED)
+            before = self._maps.get(topic)
+            if before is not None and before[1:] == grid[1:] and np.array_equal(before.values, grid.values):
                 return False
-            shown.newest = grid
-            if is_whole or region is None:
-                shown.changed = None
-                self._send(topic, GRID, self._grid_message(stamp_ns, grid))
-            else:
-                shown.changed = region if shown.changed is None else _bounding(shown.changed, region)
-                self._send(topic + UPDATES, GRID_UPDATE, self._update_message(stamp_ns, grid, shown.changed))
+            self._maps[topic] = grid
+            self._send(topic, GRID, self._grid_message(stamp_ns, grid))
             return True
 
     def fleet(
@@ -295,11 +257,6 @@ class Outputs:
         if topic not in self._publishers:
             self._publishers[topic] = self._network.publisher(resolved(self._namespace, topic), kind, quality)
 
-    def _begin_map(self, topic: str) -> _Shown:
-        self._begin(topic, GRID, LATCHED)
-        self._begin(topic + UPDATES, GRID_UPDATE, LATCHED)
-        return self._maps.setdefault(topic, _Shown())
-
     def _send(self, topic: str, kind: str, message: Any) -> None:
         self._publishers[topic](self._codec.encode(message, kind))
 
@@ -339,34 +296,6 @@ class Outputs:
         )
         header = self._codec.header(stamp_ns, self._map_frame)
         return self._codec.make(GRID, header=header, info=info, data=grid.values.ravel())
-
-    def _update_message(self, stamp_ns: int, grid: Grid, region: Region) -> Any:
-        cells = grid.values[region.y : region.y + region.height, region.x : region.x + region.width]
-        header = self._codec.header(stamp_ns, self._map_frame)
-        return self._codec.make(
-            GRID_UPDATE, header=header, **region._asdict(), data=np.ascontiguousarray(cells).ravel()
-        )
-
-
-def changed_region(before: Grid, after: Grid) -> Region | None:
-    """The smallest rectangle with all cells that changed; None if the grids do not cover the same cells.
-
-    That of equal grids has no cell.
-    """
-    if before[1:] != after[1:] or before.values.shape != after.values.shape:
-        return None
-    differs = before.values != after.values
-    rows, columns = np.flatnonzero(differs.any(axis=1)), np.flatnonzero(differs.any(axis=0))
-    if not len(rows):
-        return Region(0, 0, 0, 0)
-    x, y = int(columns[0]), int(rows[0])
-    return Region(x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1)
-
-
-def _bounding(first: Region, second: Region) -> Region:
-    x, y = min(first.x, second.x), min(first.y, second.y)
-    right, top = (max(first[k] + first[k + 2], second[k] + second[k + 2]) for k in (0, 1))
-    return Region(x, y, right - x, top - y)
 
 
 def _topic_name(robot: str) -> str:

@@ -23,11 +23,8 @@ FIX = "sensor_msgs/NavSatFix"
 """Message types that are read, as ROS 1 writes them."""
 OLD_TRANSFORMS = "tf/tfMessage"
 """The name of TRANSFORMS in early ROS 1."""
-GRID_UPDATE = "map_msgs/OccupancyGridUpdate"
-"""A part of an occupancy grid; rosbags does not know this type."""
 
 _NANOSECONDS = 10**9
-_GRID_UPDATE_FIELDS = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data"
 _LIVOX_FIELDS = """std_msgs/Header header
 uint64 timebase
 uint32 point_num
@@ -134,7 +131,6 @@ def typestore(ros1: bool) -> "Typestore":
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
     if ros1:
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", full_name(TRANSFORMS)))
-    store.register(get_types_from_msg(_GRID_UPDATE_FIELDS, full_name(GRID_UPDATE)))
     for kind in LIVOX_CLOUDS:
         store.register(get_types_from_msg(_LIVOX_FIELDS.format(package=kind.partition("/")[0]), full_name(kind)))
     return store
