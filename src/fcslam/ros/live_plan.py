@@ -60,7 +60,6 @@ class LivePlanner:
         self.odom_frame, self.base_frame = USUAL_ODOM, ""
         """Frames of the odometry, once it is there; a driver may leave them out."""
         self.is_without_odometry = options.odom_topic == NO_ODOMETRY
-        """Whether the robot is mapped without odometry."""
         self._topics, self._options, self._notify = topics, options, notify
         self._prefix = namespace.strip("/")
         self._first: list[deque[ScanMessage]] = [deque(maxlen=_SCANS_KEPT) for _ in topics.scans]

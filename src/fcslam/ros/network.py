@@ -20,7 +20,6 @@ class Quality(NamedTuple):
     latched: bool = False
     """A late subscriber gets the last messages (transient local)."""
     depth: int = 10
-    """Number of messages that are kept."""
 
 
 class Endpoint(NamedTuple):
@@ -29,7 +28,6 @@ class Endpoint(NamedTuple):
     topic: str
     """With a leading slash."""
     kind: str
-    """Type of the messages, without ``msg/``."""
     publishes: bool
     quality: Quality
     own: bool = False

@@ -73,9 +73,7 @@ class Outputs:
         self._publishers: dict[str, Publish] = {}
         """By topic; new ones are made under the lock."""
         self._maps: dict[str, Grid] = {}
-        """The newest map by topic."""
         self._teammates: set[str] = set()
-        """Topics of their poses."""
         self._goal_xy: FloatArray = np.full(2, np.nan)
         self._begin(MAP, GRID, LATCHED)
         self._begin("pose", POSE, STREAMED)

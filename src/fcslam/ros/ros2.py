@@ -61,7 +61,6 @@ class Ros2Network:
         ]
         self._lock = threading.Lock()
         self._known: dict[str, Endpoint] = {}
-        """Publishers and subscriptions by their keys."""
         self._readers: tuple[tuple[Any, Deliver], ...] = ()
         self._topics: dict[tuple[str, str], Any] = {}
         self._closed = threading.Event()

@@ -37,7 +37,6 @@ _HEARTBEAT_S = 0.5
 """Period at which a publisher of latched messages says which was its last one."""
 _PARTS = 13
 _ENDPOINTS_KNOWN = 10_000
-"""Most endpoints that are remembered."""
 
 
 class ZenohNetwork:
@@ -64,7 +63,6 @@ class ZenohNetwork:
         self._numbers = itertools.count(_NODE + 1)
         self._lock = threading.Lock()
         self._known: dict[str, Endpoint] = {}
-        """Endpoints by their tokens."""
         self._declared: list[Any] = []
         """Tokens, publishers and subscribers to undeclare at the end."""
         self._declare(session.liveliness().declare_token(self._token(_NODE, "NN")))

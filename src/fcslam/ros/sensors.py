@@ -81,23 +81,18 @@ class LiveSensors:
     def __init__(self, topics: SensorTopics, namespace: str, options: BagOptions, notify: Notify) -> None:
         """``namespace`` is "" or begins with a slash."""
         self.audit = Audit("message")
-        """Faults so far."""
         self.planner = LivePlanner(topics, namespace, options, notify)
         """What is known of the robot."""
         self.restarts = 0
-        """Number of times that the clock stepped back."""
         self._newest_stamp: float | None = None
-        """Stamp of the newest scan that was read."""
         self._topics, self._options, self._notify = topics, options, notify
         self._codec = MessageCodec(ros1=False)
         self._directions: dict[str, int] = {}
         """Directions of the scans of clouds in a full turn, by topic; the first cloud decides."""
         self._frames: dict[str, str] = {}
-        """Coordinate frame of the scans on each topic."""
         self._plan: LivePlan | None = None
         """How the robot is read, once that is known."""
         self._reader: SensorReader | None = None
-        """Reads the messages by the plan."""
         self._early: deque[tuple[int, Message]] = deque(maxlen=_LONGEST_WAIT)
         self._counts: Counter[str] = Counter()
         self._misplaced = 0

@@ -18,13 +18,11 @@ class SensorTopics:
     """The topics of one robot's sensors, by their full names."""
 
     kinds: Mapping[str, str]
-    """Type of every topic below."""
     scans: tuple[str, ...]
     """One for each laser, 3D LiDAR or depth camera."""
     odometry: str | None
     """None: odometry comes from tf."""
     transforms: tuple[str, ...]
-    """All topics of tf."""
     camera: str | None = None
     camera_info: str | None = None
     fixes: str | None = None

@@ -20,7 +20,6 @@ from fcslam.sources.source import Source
 from fcslam.untrusted import open_file
 
 LOG, BAG = "CARMEN log", "ROS bag"
-"""The formats."""
 _OTHERS: tuple[tuple[int, bytes, str], ...] = (
     (0, b"PK\x03\x04", "is a zip archive; unpack it and give the recording in it"),
     (0, b"7z\xbc\xaf\x27\x1c", "is a 7z archive; unpack it and give the recording in it"),

@@ -55,7 +55,6 @@ class ScanGate:
         self._misplaced: list[tuple[int, float]] = []
         """Numbers and stamps of the newest misplaced scans in a row."""
         self._has_stepped = False
-        """Whether the clock has stepped back."""
 
     def admits(self, number: int, stamp: float, beams: Beams | None) -> bool:
         """Whether the scan on line (or in message) ``number`` is consistent; counts its faults.

@@ -5,9 +5,7 @@ from io import BytesIO
 from fcslam.records import CameraModel
 
 MAX_IMAGE_BYTES = 1 << 25
-"""Largest image file of a camera."""
 MAX_SIDE_PX = 1 << 14
-"""Largest width or height of an image."""
 
 _FAR = 1e6
 """Bound of intrinsics in pixels and of positions in metres."""

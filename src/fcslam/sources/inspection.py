@@ -36,11 +36,9 @@ class BagContents:
     """The topics and frames of a bag."""
 
     topics: tuple[TopicContents, ...]
-    """Sorted by name."""
     transforms: tuple[tuple[str, str], ...]
     """Parent and child of the transforms in tf, in the order in which they appear."""
     laser_frames: dict[str, tuple[str, ...]]
-    """Frames of the scans on each topic of laser scans."""
 
 
 @dataclass(frozen=True, slots=True)

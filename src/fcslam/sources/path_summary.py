@@ -32,7 +32,6 @@ class PathSummary:
     length_m: float = 0.0
     """Length of the polyline through the positions."""
     moves: bool = False
-    """Whether any two successive poses differ."""
     earliest: float = inf
     latest: float = -inf
     _steps: int = 0
@@ -118,4 +117,3 @@ WITHOUT_ODOMETRY: Final = (
     "no odometry, so scan matching alone gives the motion; where the scans do not fix the position, as along a bare "
     "corridor, the distance is unknown"
 )
-"""A note about such a recording."""

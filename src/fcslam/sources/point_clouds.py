@@ -105,7 +105,6 @@ class CloudMounting(NamedTuple):
     """Heading of the level frame in which the scan is."""
     is_height_known: bool = True
     directions: int = DIRECTIONS
-    """Directions of a scan in a full turn."""
 
 
 class CloudScan(NamedTuple):
@@ -332,7 +331,6 @@ class _Turn(NamedTuple):
     angle_rad: float
     rate_rad_s: float
     begin_s: float
-    """When the turn begins."""
 
     def directions(self, count: int) -> tuple[int, Sweep]:
         """The first of ``count`` directions in spacings, and the times of the directions."""

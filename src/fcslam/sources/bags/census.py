@@ -57,7 +57,6 @@ class Broken:
     first: int
     """Number of the first one in its topic, from 1."""
     error: str
-    """Its fault."""
     count: int = 0
 
 
@@ -66,10 +65,8 @@ class TopicCensus:
     """What the messages of a topic name, in the order of the files."""
 
     number: int
-    """Counts the topics from 0."""
     count: int = 0
     span_ns: tuple[int, int] = (0, 0)
-    """First and last time of recording."""
     frames: Counter[str] = field(default_factory=Counter)
     """Frames of scans, or child frames of odometry, with their numbers of messages."""
     links: dict[Link, list[Transform]] = field(default_factory=dict)
@@ -106,7 +103,6 @@ class BagMessage(NamedTuple):
     number: int
     """Counts the topic's messages from 1."""
     bag_time_ns: int
-    """When it was recorded."""
     decoded: Any
     """Of laser scans, odometry and tf as in ``Content``; of other types an object of rosbags. An error if invalid."""
 
@@ -121,7 +117,6 @@ class BagMessage(NamedTuple):
 class _Index(NamedTuple):
     parts: tuple[BagPart, ...]
     census: dict[Topic, TopicCensus]
-    """By topic, sorted by name."""
     rows: NDArray[np.int64]
     """Time, number of the topic and of the part, and place of each message that can be read, in the order of time."""
     tape: int

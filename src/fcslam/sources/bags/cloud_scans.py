@@ -57,9 +57,7 @@ class BagScans:
         self._robot, self._scans, self._options, self._tree = robot, scans, options, tree
         self._base_frame_of = base_frame_of
         self._calibrations: dict[Topic, Calibration | None] = {}
-        """Of depth images."""
         self._mountings: dict[tuple[Topic, str], CloudMounting] = {}
-        """By topic and frame."""
 
     def of(self, topic: Topic) -> Iterator[ScanMessage]:
         """The valid scans of a topic."""

@@ -25,7 +25,6 @@ MOST_POINTS: Final = 4_000_000
 _TYPES: Final = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 """Of the values of sensor_msgs/PointField, by their number."""
 _TIMES: Final = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "timeoffset", "ts")
-"""Names of fields with the time of a point."""
 _UNITS_S: Final = (1.0, 1e-3, 1e-6, 1e-9)
 _SHORTEST_CLOUD_S, _LONGEST_CLOUD_S = 5e-3, 1.0
 """Time between the first and the last point of a cloud; it shows the unit of the times."""

@@ -142,7 +142,6 @@ def open_parts(path: Path) -> tuple[BagPart, ...]:
 def check_order(topic: str, scans: Iterable[tuple[Path, int]]) -> None:
     """Check that the scans of a topic in several files, with the times of recording, are those of one recording."""
     left_ns: dict[Path, int] = {}
-    """When another file first went on."""
     for (before, before_ns), (part, time_ns) in pairwise(scans):
         if before == part:
             continue

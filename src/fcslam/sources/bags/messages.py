@@ -41,7 +41,6 @@ class ScanMessage(NamedTuple):
     raw_ranges_m: Ranges
     """Ranges as sent, metres, shape (beam_count,)."""
     laser: int = 0
-    """Index of its topic among those of laser scans."""
     sweep: Sweep | None = None
     """Times of the beams, without a motion; None: all were measured at the stamp, or nothing is known."""
     ranges_at_stamp: Callable[[Sweep], Ranges] | None = None

@@ -44,11 +44,7 @@ class BagOptions:
     laser_poses: tuple[GivenPose, ...] = ()
     """``T_base_laser`` of each laser in metres and radians, instead of the transforms in tf; with True: upside down."""
     odom_frame: str | None = None
-    """Frame in which the odometry is."""
     base_frame: str | None = None
-    """Frame whose pose the odometry is."""
     robot: str | None = None
-    """Name of one of several robots in the bag."""
     cloud_band: CloudBand = field(default_factory=CloudBand)
-    """The points of point clouds and depth images that count."""
     correction: BagCorrection = field(default_factory=BagCorrection)

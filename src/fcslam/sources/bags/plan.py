@@ -47,7 +47,6 @@ class RecordedLaser(NamedTuple):
     frame: str | None = None
     """Frame of its scans, on a topic with several; None: any."""
     is_in_sectors: bool = False
-    """Whether its messages are sectors of a turn."""
 
     @property
     def name(self) -> str:
@@ -99,7 +98,6 @@ class BagPlan(NamedTuple):
     tree: TransformTree
     scans: BagScans
     lasers: tuple[RecordedLaser, ...]
-    """In the order of their topics."""
     odometry: OdometryInput | None
     """The chosen topic, else tf; one that says nothing is none."""
     odometry_ahead_s: float
@@ -153,7 +151,6 @@ class _Planner:
         self._tree = robot.bag.tree(robot.transforms)
         self._scans = BagScans(robot, self._topics.scans, options, self._tree, self._base_frame_of)
         self._notes: list[str] = []
-        """Why an odometry is not used, or not as it is."""
 
     def plan(self) -> BagPlan:
         """Decide everything."""

@@ -23,9 +23,7 @@ class ReadLaser(NamedTuple):
     """How the messages of a laser are read."""
 
     beams: Beams
-    """Its usual beams."""
     is_in_sectors: bool
-    """Whether its messages are sectors of a turn."""
 
 
 class SensorReader:

@@ -46,7 +46,6 @@ class StoredMessage(NamedTuple):
     kind: str
     """Type, without ``msg/``, as ROS 1 writes it."""
     time_ns: int
-    """When it was recorded."""
     payload: bytes
     place: MessagePlace
 
@@ -61,7 +60,6 @@ _ENDS = ValueError, KeyError, struct.error
 
 class _Chunk(NamedTuple):
     start: int
-    """Where its packed bytes begin in the file."""
     packed_bytes: int
     compression: str
     size: int

@@ -42,7 +42,6 @@ class MountedSensor(NamedTuple):
     name: str
     topic: str
     kind: str
-    """Type of its messages."""
     frame: str
 
 
@@ -50,9 +49,7 @@ class Rig(NamedTuple):
     """Lasers and camera of a robot."""
 
     lasers: tuple[LaserModel, ...]
-    """In the order of their topics."""
     upside_down: tuple[bool, ...]
-    """Of each laser."""
     camera: CameraModel | None
 
     def scan(self, posed: PosedScan) -> LaserScan:

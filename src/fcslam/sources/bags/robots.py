@@ -32,7 +32,6 @@ class BagRobot(NamedTuple):
     """A namespace or the prefix of frames, with a slash in front."""
     topics: tuple[Topic, ...]
     transforms: tuple[Topic, ...]
-    """Those of tf."""
     scan_frames: Mapping[str, tuple[str, ...]]
     """By the name of a topic; each frame is that of a laser."""
     base_frames: Mapping[str, str]
@@ -43,12 +42,10 @@ class BagRobot(NamedTuple):
 @dataclass(slots=True)
 class _Member:
     space: str
-    """Namespace."""
     transforms: tuple[Topic, ...]
     tree: TransformTree
     scan_frames: dict[Topic, list[str]] = field(default_factory=dict)
     base_frames: dict[Topic, str] = field(default_factory=dict)
-    """Of the odometry on topics."""
 
     @property
     def frame(self) -> str:

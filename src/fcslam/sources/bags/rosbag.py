@@ -56,7 +56,6 @@ class _Reading(NamedTuple):
     band: CloudBand
     """The points of clouds that count."""
     placeholders: tuple[tuple[float, ...], ...]
-    """Values that are no ranges, of each laser."""
     base_frame: str
 
 
@@ -76,7 +75,6 @@ class RosBag:
         self.path = path
         self._notes = notes
         self._options = options or BagOptions()
-        """The options by which it is read."""
         topics, poses = self._options.scan_topics, self._options.laser_poses
         if topics and 0 < len(poses) < len(topics):
             raise SourceError(

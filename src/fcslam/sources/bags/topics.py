@@ -37,9 +37,7 @@ class KnownTopics(NamedTuple):
     """The topics from which those of one robot are chosen."""
 
     own: Sequence[Topic]
-    """Those of the robot."""
     transforms: tuple[Topic, ...]
-    """Those of tf."""
     label: str
     """What messages begin with: the bag, or nothing."""
     others: Sequence[Topic] = ()
@@ -63,11 +61,9 @@ class Topics(NamedTuple):
     odometry: tuple[Topic, ...]
     """One topic of odometry, or those of tf; empty without either."""
     transforms: tuple[Topic, ...]
-    """Those of tf."""
     camera: Topic | None
     """Images; None without readable or calibrated images."""
     camera_info: Topic | None
-    """Calibration of these images."""
     notes: tuple[str, ...]
 
 

@@ -110,7 +110,6 @@ class _Bag:
         self._bag_time_ns = -1
         self._mounted: set[str] = set()
         self._mountings: list[tuple[float, float, float]] = []
-        """Of each laser."""
         self._latest_reading: tuple[float, ...] = ()
 
     def write(self, item: SensorRecord) -> None:

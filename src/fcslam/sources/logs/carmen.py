@@ -70,7 +70,6 @@ class OdometryLine(NamedTuple):
     """One reading of the odometry."""
 
     stamp: float
-    """As in ``ScanLine``."""
     T_odom_base: Pose
 
 

@@ -58,16 +58,13 @@ class _Reading(NamedTuple):
     pose_from_odometry: bool
     """Whether scans take the pose of the latest odometry message, because their own never changes."""
     has_odometry: bool
-    """Whether the poses are those of wheels."""
     placeholders: tuple[float, ...]
-    """Values that are not ranges."""
 
 
 class _Scan(NamedTuple):
     line: ScanLine
     beams: Beams
     T_odom_base: Pose
-    """The pose to use."""
 
 
 class TextLog:
