@@ -333,7 +333,8 @@ def test_an_orientation_that_is_none_is_named(tmp_path):
     assert "/odom cannot be read (the orientation 0, 0, 0, 0 is not a unit quaternion)" in first
     assert "no odometry" in second
     message = refusal(save(tmp_path / "tf.bag", with_fields(drive(30), "/tf_static", rotation=NOT_A_ROTATION)))
-    assert "no transform from 'base_link' to 'laser' (/tf_static, message 1 of it: the orientation 0" in message
+    assert "no transform from 'base_link' to 'laser', so the pose of the laser of /scan is unknown" in message
+    assert "(/tf_static, message 1 of it: the orientation 0" in message
 
 
 def test_the_metadata_of_a_bag_are_no_bag(tmp_path):

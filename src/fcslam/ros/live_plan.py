@@ -168,6 +168,6 @@ class LivePlanner:
 def missing_mounting(error: NoTransformError) -> str:
     """What a robot waits for if tf lacks the mounting of a laser."""
     return (
-        f"waits for tf: it has {error}, so the pose of a laser is unknown; start robot_state_publisher or "
+        f"waits for tf: it has {error}; start robot_state_publisher or "
         "static_transform_publisher, or give --sensors laser-pose=X,Y,THETA (metres, radians)"
     )

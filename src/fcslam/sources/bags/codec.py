@@ -24,7 +24,7 @@ FIX = "sensor_msgs/NavSatFix"
 OLD_TRANSFORMS = "tf/tfMessage"
 """The name of TRANSFORMS in early ROS 1."""
 
-_NANOSECONDS = 10**9
+NANOSECONDS = 10**9
 _LIVOX_FIELDS = """std_msgs/Header header
 uint64 timebase
 uint32 point_num
@@ -87,7 +87,7 @@ class MessageCodec:
 
     def time(self, stamp_ns: int) -> Any:
         """A time stamp."""
-        seconds, nanoseconds = divmod(stamp_ns, _NANOSECONDS)
+        seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
         return self.make("builtin_interfaces/Time", sec=seconds, nanosec=nanoseconds)
 
     def header(self, stamp_ns: int, frame: str) -> Any:

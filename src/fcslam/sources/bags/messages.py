@@ -8,6 +8,7 @@ import numpy as np
 
 from fcslam.geometry.beams import FULL_TURN_RAD, SAME_VIEW_BEAMS, is_field_of_view
 from fcslam.records import Beams, Ranges, Sweep, Transform
+from fcslam.sources.bags.codec import NANOSECONDS
 from fcslam.sources.bags.transforms import planar, transform_of
 from fcslam.sources.pose import Pose
 
@@ -22,7 +23,6 @@ _COUNT_TOLERANCE = 0.01
 _MAX_COORDINATE_M = 1e7
 _LONGEST_FRAME = 255
 """Characters in the name of a frame, as in that of a topic."""
-_NANOSECONDS = 10**9
 
 
 class BeamsError(ValueError):
@@ -171,8 +171,8 @@ def _angle_rad(single: float) -> float:
 
 def header_of(header: Any, bag_time_ns: int) -> tuple[float, str]:
     """Stamp and frame of a header; a zero stamp is replaced by the time of recording."""
-    stamp_ns = header.stamp.sec * _NANOSECONDS + header.stamp.nanosec
-    return (stamp_ns or bag_time_ns) / _NANOSECONDS, frame_of(header.frame_id)
+    stamp_ns = header.stamp.sec * NANOSECONDS + header.stamp.nanosec
+    return (stamp_ns or bag_time_ns) / NANOSECONDS, frame_of(header.frame_id)
 
 
 def frame_of(name: str) -> str:

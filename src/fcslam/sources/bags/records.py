@@ -13,6 +13,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from fcslam.sources.bags.codec import NANOSECONDS
 from fcslam.untrusted import MOST_STREAM_RATIO, check_unpacked, open_database, open_file, unpack
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
@@ -25,7 +26,6 @@ _REREAD_RATIO = 10 * MOST_STREAM_RATIO
 _HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x01, 0x03, 0x04, 0x05, 0x06, 0x0F
 _ROS1_MESSAGE, _ROS1_CHUNK, _ROS1_CONNECTION = b"\x02", b"\x05", b"\x07"
 _ROS1_MAGIC_BYTES = len(b"#ROSBAG V2.0\n")
-_SECOND_NS = 10**9
 _SQLITE_HEADER_BYTES = 100
 
 
@@ -178,7 +178,7 @@ class RecordFile:
                 seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
                 connection = int.from_bytes(fields[b"conn"], "little")
                 if connection in self.topics:
-                    time_ns, place = seconds * _SECOND_NS + nanoseconds, MessagePlace(chunk, start, size)
+                    time_ns, place = seconds * NANOSECONDS + nanoseconds, MessagePlace(chunk, start, size)
                     yield StoredMessage(*self.topics[connection], time_ns, content, place)
 
     def _in_chunk(self, chunk: _Chunk, packed: bytes, crc: int = 0) -> Iterator[StoredMessage]:

@@ -28,14 +28,6 @@ class MountingError(FcslamError):
     """A laser cannot be read as it is mounted; the message says why, and what to do."""
 
 
-class UnknownMountingError(NoTransformError):
-    """tf does not say where a sensor sits."""
-
-    def __init__(self, reason: str, sensor: str) -> None:
-        super().__init__(reason)
-        self.sensor = sensor
-
-
 class MountedSensor(NamedTuple):
     """A laser or a sensor of clouds on its robot."""
 
@@ -124,7 +116,7 @@ def _mounting_in(tree: TransformTree, base_frame: str, sensor: MountedSensor) ->
     try:
         mounted = mounting(tree.fixed(base_frame, sensor.frame))
     except NoTransformError as error:
-        raise UnknownMountingError(str(error), sensor.name) from error
+        raise NoTransformError(f"{error}, so the pose of the laser of {sensor.name} is unknown") from error
     away_m = hypot(*mounted.T_base_laser[:2])
     if away_m > _FARTHEST_M:
         raise MountingError(

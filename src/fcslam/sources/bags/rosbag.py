@@ -27,14 +27,13 @@ from fcslam.sources.bags.rig import (
     MountedSensor,
     MountingError,
     Rig,
-    UnknownMountingError,
     mounted_camera,
     mountings_of,
     rig_of,
     tilt_note,
 )
 from fcslam.sources.bags.robots import BagRobot, robot_of, robots_of, slashed
-from fcslam.sources.bags.transforms import USUAL_BASES, Mounting
+from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformError
 from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
@@ -282,12 +281,11 @@ class RosBag:
             return mountings_of(sensors, self.plan.tree, base_frame, poses)
         except MountingError as error:
             raise SourceError(f"{self.path}: {error}") from error
-        except UnknownMountingError as error:
+        except NoTransformError as error:
             raise SourceError(
-                f"{self.path}: tf has {error}{_in_brackets(errors)}, so the pose of the laser of {error.sensor} is "
-                "unknown; give it with --sensors laser-pose=X,Y,THETA (metres, radians)"
-                f"{' for each laser' * (len(lasers) > 1)}; if it is in another part of this recording, give both "
-                "joined by a comma"
+                f"{self.path}: tf has {error}{_in_brackets(errors)}; give it with --sensors laser-pose=X,Y,THETA "
+                f"(metres, radians){' for each laser' * (len(lasers) > 1)}; if it is in another part of this "
+                "recording, give both joined by a comma"
             ) from error
 
     @property

@@ -23,6 +23,7 @@ from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     FIX,
+    NANOSECONDS,
     ODOMETRY,
     SCAN,
     TRANSFORMS,
@@ -48,7 +49,6 @@ _FIRST_TOPICS = {"/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS,
 _IMAGE_TOPIC, _CAMERA_INFO_TOPIC = "/camera/image_raw/compressed", "/camera/camera_info"
 _IMAGE_FORMATS = {"jpg": "jpeg", "png": "png"}
 _END_OF_TIME_S = 2**31
-_NANOSECONDS = 10**9
 
 
 def write_bag(path: Path, records: Iterable[SensorRecord]) -> None:
@@ -142,7 +142,7 @@ class _Bag:
         suffix = f"_{number}" * (number > 1)
         self._mount(stamp_ns, _LASER + suffix, in_space(np.array(T_base_laser)))
         begin_s = 0.0 if scan.sweep is None else min(scan.sweep.first_s, scan.sweep.last_s)
-        header = self._codec.header(stamp_ns + round(begin_s * _NANOSECONDS), _LASER + suffix)
+        header = self._codec.header(stamp_ns + round(begin_s * NANOSECONDS), _LASER + suffix)
         self._put(_SCAN_TOPIC + suffix, SCAN, self._scan(header, scan))
 
     def _put_image(self, stamp_ns: int, image: CameraImage) -> None:
@@ -232,4 +232,4 @@ def _nanoseconds(stamp: float) -> int:
     if not 0.0 <= stamp < _END_OF_TIME_S:
         raise InputError(f"a bag has no stamp {stamp:.6f} s; ROS counts from 0 s to {_END_OF_TIME_S} s")
     seconds = int(stamp)
-    return seconds * _NANOSECONDS + round((stamp - seconds) * _NANOSECONDS)
+    return seconds * NANOSECONDS + round((stamp - seconds) * NANOSECONDS)
