@@ -17,9 +17,6 @@ import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator, UserWideCacheLocator
 from numba.core.runtime import rtsys
 
-INSTALLED = frozenset({"site-packages", "dist-packages"})
-"""Folders of packages that pip manages."""
-
 _uncached: list[str] = []
 
 
@@ -72,7 +69,7 @@ class _CachedCode(CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes: Sequence[type] = CompileResultCacheImpl._locator_classes
 
     def __init__(self, function: Any) -> None:
-        if INSTALLED & set(Path(function.__code__.co_filename).parts):
+        if {"site-packages", "dist-packages"} & set(Path(function.__code__.co_filename).parts):
             self._locator_classes = [UserProvidedCacheLocator, UserWideCacheLocator, *self._locator_classes]
         super().__init__(function)
 

@@ -54,7 +54,12 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     try:
         unfinished.mkdir()
         yield unfinished
-        _exchange(path, unfinished, retired)
+        if path.exists():
+            path.rename(retired)
+        try:
+            unfinished.rename(path)
+        finally:
+            bring_back(path)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
         shutil.rmtree(retired, ignore_errors=True)
@@ -66,15 +71,3 @@ def bring_back(path: Path) -> None:
         for retired in path.parent.glob(f".{glob.escape(path.name)}.*.retired"):
             retired.rename(path)
             return
-
-
-def _exchange(path: Path, unfinished: Path, retired: Path) -> None:
-    """Put ``unfinished`` in the place of ``path``; if that fails, the old folder comes back."""
-    if path.exists():
-        path.rename(retired)
-    try:
-        unfinished.rename(path)
-    except BaseException:
-        if retired.exists():
-            retired.rename(path)
-        raise

@@ -44,9 +44,7 @@ class FleetClient(HttpClient):
 
     def quality(self, robot: str) -> tuple[QualityReply, ...]:
         """How good the map is that a robot is in; none before its certificate is computed."""
-        response = self._ask("GET", f"quality?robot={quote(robot, safe='')}", passes=(404,))
-        if response.status_code == 404:  # a cloud of an older version
-            return ()
+        response = self._ask("GET", f"quality?robot={quote(robot, safe='')}")
         with self._reading():
             return _QUALITY.validate_json(response.content)
 

@@ -80,11 +80,10 @@ class HttpClient:
     """Connection to one cloud; where one of its instances does not answer, the next request asks the next one."""
 
     def __init__(self, url: str, shown: Credentials = NO_CREDENTIALS, headers: Mapping[str, str] | None = None) -> None:
-        """Open a client; every request has the ``headers``.
+        """Open a client of the address ``url``, or of several with commas between them; each request has the headers.
 
         Raises:
-            CloudError: ``url`` is not an address, or those of instances with commas between them, or would send the
-                token unencrypted; a file of ``shown`` cannot be read.
+            CloudError: it is no address, a token would be sent unencrypted, or a file of ``shown`` cannot be read.
         """
         import httpx
 
