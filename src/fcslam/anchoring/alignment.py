@@ -8,6 +8,7 @@ import numpy as np
 from fcslam.anchoring.lengths import lengths_in_plan
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.geometry import se2
+from fcslam.graph.evidence import LEAD
 from fcslam.lidar.submap import SPACING_M, Submap, agreement
 from fcslam.records import FloatArray
 
@@ -19,8 +20,6 @@ LEAST_SURFACE_M: Final = 25.0
 """Least length of the plan's surface that the scans saw, and of the map's surface that the plan has."""
 LEAST_SHARE: Final = 0.3
 """Least share of the map's surface that the plan has: the rest is furniture."""
-LEAD: Final = 2.0
-"""Least ratio of the score to that of the best alignment elsewhere."""
 LEAST_RIVAL_M: Final = 10.0
 """Score of an alignment elsewhere that is always assumed."""
 LEAST_THICKNESS_M, MOST_THICKNESS_M = 0.02, 0.15

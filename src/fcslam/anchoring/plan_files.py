@@ -41,10 +41,8 @@ _NOT_WALLS: Final = ("TEXT", "MTEXT", "ATTRIB", "ATTDEF", "DIMENSION", "LEADER",
 def read_plan(path: Path, scale: float | None = None) -> OccupancyMap:
     """Read a floor plan: occupied cells are its lines, the others are free. Its coordinates are those of the plan.
 
-    Args:
-        path: a PNG (or JPEG, BMP, TIFF) drawing, whose origin is its lower left corner; the YAML file of a ROS map; or
-            a DXF drawing.
-        scale: metres per pixel of a drawing; metres per unit of a DXF file that does not name its unit.
+    It is a PNG (or JPEG, BMP, TIFF) drawing, whose origin is its lower left corner, the YAML file of a ROS map, or a
+    DXF drawing. ``scale``: metres per pixel of a drawing, or per unit of a DXF file that does not name its unit.
     """
     if scale is not None and not 0.0 < scale < math.inf:
         raise SourceError(f"--plan-scale {scale:g}: give metres per pixel, above 0")

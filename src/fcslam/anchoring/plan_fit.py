@@ -45,8 +45,7 @@ def map_submap(robots: Sequence[MappedRobot]) -> Submap:
 def fit_to_plan(plan: BuildingPlan, part: MapPart, T_plan_map: FloatArray) -> tuple[MapPart, dict[str, float]]:
     """Fit a map to the plan, from its alignment ``T_plan_map``, shape (3,), metres and radians.
 
-    Returns:
-        The map in the plan, with ranges in its scale, and the scale of each robot's lengths.
+    Returns the map in the plan, with ranges in its scale, and the scale of each robot's lengths.
     """
     robots, graph = part.robots, part.graph
     found = {

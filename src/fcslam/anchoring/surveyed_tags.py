@@ -83,10 +83,9 @@ class _Place:
 
 
 class MapTags:
-    """The tags of one map."""
+    """The tags of one map, by sightings of its robots."""
 
     def __init__(self, robots: Sequence[MappedRobot], sightings: Sequence[TagSighting]) -> None:
-        """``robots`` of the map; sightings by others do not count."""
         self._robots = {robot.robot: robot for robot in robots}
         by_tag: dict[Tag, list[TagSighting]] = {}
         for one in sightings:
@@ -98,10 +97,6 @@ class MapTags:
     def variable(self, sighting: TagSighting) -> int:
         """Number of the variable of its keyscan."""
         return int(self._robots[sighting.id.robot].variables[sighting.id.number])
-
-    def of(self, tags: Sequence[Tag]) -> list[TagSighting]:
-        """Sightings of these tags at their first places."""
-        return [one for tag in tags for one in self.places[tag][0].sightings]
 
     def _pose(self, sighting: TagSighting) -> FloatArray:
         robot, keyscan = sighting.id
@@ -291,15 +286,14 @@ def _solve(graph: PoseGraph, poses: FloatArray, tags: MapTags, used: Sequence[Ta
     """Solve with the positions of surveyed tags; all sightings of a tag count as one measurement."""
     if len(used) < 2:
         return poses
-    sightings = tags.of(used)
-    counts = {tag: len(tags.places[tag][0].sightings) for tag in used}
+    seen = {tag: tags.places[tag][0].sightings for tag in used}
     for _ in range(_ROUNDS):
         priors = []
-        for one in sightings:
+        for one in (one for tag in used for one in seen[tag]):
             variable = tags.variable(one)
             arm = se2.compose(np.array((0.0, 0.0, poses[variable, 2])), one.T_base_tag)[:2]
             variance = np.linalg.inv(one.information)[:2, :2].trace() / 2.0 + SURVEY_SIGMA_M**2
-            weight = 1.0 / (variance * counts[one.tag])
+            weight = 1.0 / (variance * len(seen[one.tag]))
             priors.append(position_prior(variable, survey[one.tag][:2] - arm, poses[variable, 2], weight))
         poses = optimize_anchored(graph, poses, priors)
     return poses

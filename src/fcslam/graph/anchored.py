@@ -30,15 +30,10 @@ class PosePrior:
 
 
 def optimize_anchored(graph: PoseGraph, initial: FloatArray, priors: Sequence[PosePrior]) -> FloatArray:
-    """Optimize a pose graph with priors.
+    """Optimize a pose graph, all of whose edges count, with priors; returns poses (N, 3) in the frame of the priors.
 
-    Args:
-        graph: N variables; all of its edges count.
-        initial: poses to start from in the frame of the priors, shape (N, 3), metres and radians.
-        priors: at least one for each connected component, and together they fix its pose.
-
-    Returns:
-        Poses in the frame of the priors, shape (N, 3).
+    The poses to start from, shape (N, 3), are in this frame, too. Each connected component has priors that fix its
+    pose.
     """
     problem = FactorCache(graph).floating(np.ones(int(graph.arrays().robust.sum())))
     for prior in priors:

@@ -65,17 +65,8 @@ def decide_cluster(
     settings: ConsistencySettings,
     examine: Examine = lambda _: None,
 ) -> ClusterDecision:
-    """Decide whether the closures between two robots have a dominant cluster.
-
-    Args:
-        a, b: trajectories of the robots, each in its own coordinate frame.
-        closures: K closures from a to b.
-        informative: whether each closure fixes the pose in every direction, shape (K,).
-        settings: what a cluster needs.
-        examine: compares the maps at the transform of a cluster.
-
-    Returns:
-        The decision; its members are rows of ``closures``.
+    """Decide whether the K closures from a to b have a dominant cluster; ``informative`` (K,): those that fix every
+    direction.
     """
     consistent = pairwise_consistency(a, b, closures)
     positions = closure_positions(a, b, closures)
@@ -97,18 +88,11 @@ def closure_positions(a: Trajectory, b: Trajectory, closures: Closures) -> Float
 
 
 def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
-    """Estimate ``T_a_b`` of the frames of two trajectories from the two matched places that lie farthest apart.
+    """Estimate ``T_a_b`` (3,) of the frames of two trajectories from the two matched places that lie farthest apart.
 
     Implements eqs. (5)-(6) of FC-SLAM. If these places are too close to each other in a or b to fix a rotation, the
     first closure alone gives the transform. Tags fix the heading worse than walls, so closures by tags count only
     without others, and then all of them by their information.
-
-    Args:
-        a, b: trajectories, each in its own coordinate frame.
-        closures: at least one closure from a to b.
-
-    Returns:
-        ``T_a_b``, shape (3,), metres and radians.
     """
     if (closures.tags > 0).any():
         walls = np.flatnonzero(closures.tags == 0)

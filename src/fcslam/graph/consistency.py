@@ -65,15 +65,7 @@ class Closures:
 
 
 def pairwise_consistency(a: Trajectory, b: Trajectory, closures: Closures) -> NDArray[np.bool_]:
-    """Test every pair of closures for consistency.
-
-    Args:
-        a, b: trajectories, each in its own coordinate frame.
-        closures: K closures from a to b.
-
-    Returns:
-        Which pairs are consistent, shape (K, K), symmetric, true on the diagonal.
-    """
+    """Which pairs of K closures between two trajectories are consistent, shape (K, K), symmetric."""
     _check(closures.i, len(a), "a")
     _check(closures.j, len(b), "b")
     k, m = np.triu_indices(len(closures), 1)
@@ -84,18 +76,11 @@ def pairwise_consistency(a: Trajectory, b: Trajectory, closures: Closures) -> ND
 
 
 def count_supporting_closures(a: Trajectory, b: Trajectory, closures: Closures) -> NDArray[np.int64]:
-    """Count the closures that support each closure.
+    """Count the closures that support each of K closures, shape (K,); ``a`` is ``b`` for closures within one robot.
 
     Two closures support each other if they are consistent and their ends are near each other along both paths, where
     drift can hardly explain the agreement. Robots that visit the same place close several loops there; a false closure
     is usually isolated.
-
-    Args:
-        a, b: trajectories; the same object for closures within one robot.
-        closures: K closures from a to b.
-
-    Returns:
-        Number of supporting closures of each closure, shape (K,).
     """
     if a is b:
         closures = closures.reversed(closures.i > closures.j)
@@ -111,15 +96,9 @@ def count_supporting_closures(a: Trajectory, b: Trajectory, closures: Closures) 
 def loop_chi2(
     a: Trajectory, b: Trajectory, closures: Closures, k: NDArray[np.int64], m: NDArray[np.int64]
 ) -> FloatArray:
-    """Squared Mahalanobis length of loops: back over closure k, along a, over closure m, back along b.
+    """Squared Mahalanobis length (P,) of loops: back over closure k, along a, over closure m, back along b.
 
-    Args:
-        a, b: trajectories, each in its own coordinate frame.
-        closures: K closures from a to b.
-        k, m: rows of the two closures of each loop, shape (P,).
-
-    Returns:
-        Chi-square with three degrees of freedom, shape (P,).
+    ``k`` and ``m`` are the rows of the two closures of each loop. The result has three degrees of freedom.
     """
     i, j, T_i_j = closures.i, closures.j, closures.T_i_j
     along_a = se2.between(a.poses[i[k]], a.poses[i[m]])

@@ -26,15 +26,10 @@ _Complex = NDArray[np.complex128]
 
 
 def initialize(graph: PoseGraph, weights: ArrayLike | None = None) -> FloatArray:
-    """Compute poses near the optimum of the graph without any initial estimate.
+    """Poses (N, 3) near the optimum of the graph without any initial estimate.
 
-    Args:
-        graph: N variables and E edges; each connected component keeps the initial pose of its first variable.
-        weights: factors in [0, 1] of the edges' information, shape (E,); an edge of weight 0 is left out
-            (``~graph.arrays().robust`` leaves odometry alone). None: all are 1.
-
-    Returns:
-        Poses, shape (N, 3), metres and radians.
+    Each connected component keeps the initial pose of its first variable. ``weights`` (E,) in [0, 1] scale the edges'
+    information; an edge of weight 0 is left out (``~graph.arrays().robust`` leaves odometry alone). None: all are 1.
     """
     edges = graph.arrays()
     scale = np.ones(len(edges.i)) if weights is None else np.asarray(weights, dtype=np.float64)
@@ -59,13 +54,12 @@ def initialize(graph: PoseGraph, weights: ArrayLike | None = None) -> FloatArray
 
 
 def initialize_robust(graph: PoseGraph) -> FloatArray:
-    """Compute poses as ``initialize``, with closures reweighted until false ones hardly count.
+    """Compute poses (N, 3) as ``initialize``, with closures reweighted until false ones hardly count.
 
     Iteratively reweighted least squares with weight ``d^-1.8`` at a residual of d > 1 standard deviations. After large
-    drift, ``fcslam.graph.optimizer.optimize_gnc`` converges from here and not from odometry. We tried the INTEL
-    graph of 1,228 poses with as many random false closures as true ones. From here it keeps every true closure and
-    rejects every false one; from odometry it loses two thirds of the true ones.
-
+    drift, ``fcslam.graph.optimizer.optimize_gnc`` converges from here and not from odometry. We tried the INTEL graph
+    of 1,228 poses with as many random false closures as true ones. From here it keeps every true closure and rejects
+    every false one; from odometry it loses two thirds of the true ones.
     """
     robust = graph.arrays().robust
     weights = np.ones(len(robust))

@@ -145,10 +145,7 @@ def parse_image(name: str, pgm: bytes, description: str) -> MapImage:
 def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
     """Read back what ``pgm_bytes`` and ``map_yaml`` wrote; also what map_server saves in the mode trinary.
 
-    Args:
-        name: what messages call the map.
-        pgm: content of the image file.
-        description: content of the YAML file; the image that it names is not opened.
+    Messages call the map ``name``; the image that the description names is not opened.
     """
     image = parse_image(name, pgm, description)
     cells = frozen(_looked_up(image.meaning, image.pixels), np.uint8)

@@ -35,13 +35,7 @@ _ROUNDING: Final = 1e-6
 
 
 def parse_ros_map(name: str, image: bytes, description: str) -> OccupancyMap:
-    """Read a map from its image and its description.
-
-    Args:
-        name: what messages call the map.
-        image: content of the image file.
-        description: content of the YAML file; the image that it names is not opened.
-    """
+    """Read a map, which messages call ``name``, from its image and its description, whose image is not opened."""
     try:
         return _map(image, description)
     except (OSError, ValueError, cv2.error) as error:

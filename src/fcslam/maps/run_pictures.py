@@ -17,13 +17,9 @@ def picture(
     closures: Sequence[LoopClosure],
     keyscans: Mapping[str, FloatArray],
 ) -> bytes:
-    """The map with trajectories, and a line for each accepted closure between robots.
+    """The map with trajectories (N, 3) by session, and a line for each accepted closure between robots.
 
-    Args:
-        occupancy: the map.
-        trajectories: poses (N, 3) in the map, by session.
-        closures: all closures; those with an end outside of the map are left out.
-        keyscans: poses (K, 3) of the keyscans in the map, by session.
+    ``keyscans`` are poses (K, 3) by session; closures with an end outside of the map are left out.
     """
     lines = [
         np.array((keyscans[i.robot][i.number, :2], keyscans[j.robot][j.number, :2]))
