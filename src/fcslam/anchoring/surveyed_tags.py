@@ -112,7 +112,8 @@ class MapTags:
             groups[-1].append(one)
         places: list[_Place] = []
         for visit in sorted((self._mean(group) for group in groups), key=lambda place: -len(place.sightings)):
-            near = next((k for k, other in enumerate(places) if _gap_m(other, visit) <= ELSEWHERE_M), None)
+            gaps_m = (float(np.hypot(*(other.pose[:2] - visit.pose[:2]))) for other in places)
+            near = next((k for k, gap_m in enumerate(gaps_m) if gap_m <= ELSEWHERE_M), None)
             if near is None:
                 places.append(visit)
             else:
@@ -187,10 +188,6 @@ class MapTags:
         arms = arms - np.average(arms, axis=0, weights=weights)
         off = ends - np.average(ends, axis=0, weights=weights)
         return float(weights @ (arms**2).sum(axis=1)), float(weights @ (arms * off).sum(axis=1))
-
-
-def _gap_m(a: _Place, b: _Place) -> float:
-    return float(np.hypot(*(a.pose[:2] - b.pose[:2])))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

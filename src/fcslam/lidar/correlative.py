@@ -121,7 +121,7 @@ def search_pyramid(
     better_than: FloatArray | None = None,
 ) -> SearchResult:
     """As ``search``, on a pyramid that was built before; poses have shape (3,)."""
-    reach = _quantile(np.hypot(*scan.points.T), REACH_QUANTILE) if len(scan) else 1.0
+    reach = float(np.quantile(np.hypot(*scan.points.T), REACH_QUANTILE)) if len(scan) else 1.0
     step_rad = 2.0 * np.arcsin(min(0.5, 0.5 * pyramid.cell_m / max(reach, 1.0)))
     turns = math.ceil(window.angle_rad / step_rad)
     shifts = math.ceil(window.radius_m / pyramid.cell_m)
@@ -141,15 +141,6 @@ def search_pyramid(
         window.angle_penalty,
     )
     return SearchResult(pose, score)
-
-
-def _quantile(values: FloatArray, share: float) -> float:
-    """As ``np.quantile``, which needs a tenth of a millisecond for a scan."""
-    position = share * (len(values) - 1)
-    low = int(position)
-    high = min(low + 1, len(values) - 1)
-    ordered = np.partition(values, (low, high))
-    return float(ordered[low] + (position - low) * (ordered[high] - ordered[low]))
 
 
 @njit

@@ -199,26 +199,17 @@ def _stretches(query: Submap, target: Submap, T_target_query: FloatArray) -> _St
 
 def _length_m(points: FloatArray) -> float:
     """Length of the walls of at least ``WALL_M`` among points ``SPACING_M`` apart, shape (N, 2)."""
-    from scipy.ndimage import label  # most robots are alone, and SciPy takes long to load
+    from scipy.ndimage import binary_dilation, label  # most robots are alone, and SciPy takes long to load
 
     if not len(points):
         return 0.0
     cells = np.floor((points - points.min(axis=0)) / SPACING_M).astype(np.int64)
     image = np.zeros(cells.max(axis=0) + 1, bool)
     image[tuple(cells.T)] = True
-    wall = label(_grown(image), np.ones((3, 3)))[0][tuple(cells.T)]
+    around = np.ones((3, 3), np.bool_)
+    wall = label(binary_dilation(image, around), around)[0][tuple(cells.T)]  # points with a gap of a cell are connected
     walls = (points[wall == number] for number in np.unique(wall))
     return SPACING_M * sum(len(each) for each in walls if np.hypot(*np.ptp(each, axis=0)) >= WALL_M)
-
-
-def _grown(image: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The image and the cells beside it, so that points with a gap of a cell are connected."""
-    padded, grown = np.pad(image, 1), image.copy()
-    rows, columns = image.shape
-    for row in range(3):
-        for column in range(3):
-            grown |= padded[row : row + rows, column : column + columns]
-    return grown
 
 
 @njit
