@@ -3,12 +3,12 @@
     FCSLAM_DATA=/path/to/data python benchmarks/figure4.py [--features vgg.onnx onnx orb]
 
 The paper's 2,680 scenes of TUM sequences are not at hand. In their place arrive, one environment after another and 40
-at a time: street scenes, rendered and real rooms, the floors of a tower but 11 to 15, a corridor, a desk; 500
-features on grey images of 400 pixels. The paper has one group of a target, another view and eight wrong places; here
-there are 120 groups from tower, corridor and desk, whose targets never arrive. Similarity is eq. (4) on the scale of
-[0, 1]; the last table asks the index itself, with its default scoring, after the last place. Bands: 95 % by bootstrap
-over groups. rebuild trains at every place, as Algorithm 1 does; windowed after every fifth batch. The fixed tree is
-trained on photographs. The picture is that of the first features.
+at a time: street scenes, rendered and real rooms, the floors of a tower but 11 to 15, a corridor, a desk; 500 features
+on grey images of 400 pixels. The paper has one group of a target, another view and eight wrong places; here there are
+120 groups from tower, corridor and desk, whose targets never arrive. Similarity is eq. (4) on the scale of [0, 1]; the
+last table asks the index itself, with its default scoring, after the last place. Bands: 95 % by bootstrap over groups.
+rebuild trains at every place, as Algorithm 1 does. The fixed tree is trained on photographs. The picture is that of the
+first features.
 """
 
 from collections.abc import Iterator, Mapping

@@ -30,6 +30,8 @@ from fcslam.records import Codes, FloatArray
 SETS = ("rtabmap_corridor", "ie_tower", "tum_rgbd/freiburg1_rpy")
 MOVES = ((1, 0), (0, 1), (2, 1), (1, 2), (0, 2))
 SEED = 1
+FIXED = VocabularyConfig(strategy=Strategy.REBUILD, train_batch=1_000_000)
+"""Never trained again after ``train``."""
 
 
 class School(NamedTuple):
@@ -70,15 +72,14 @@ def _simulation(folder: Path, features: FeatureChoice) -> School:
 
 def _move(origin: School, goal: DescribedSet, scoring: Scoring) -> Iterator[tuple[object, ...]]:
     methods = {
-        "static, trained there": (_gallery(goal), Strategy.STATIC),
-        "static, moved": (origin, Strategy.STATIC),
-        "incremental, moved": (origin, Strategy.INCREMENTAL),
+        "static, trained there": (_gallery(goal), FIXED),
+        "static, moved": (origin, FIXED),
+        "incremental, moved": (origin, VocabularyConfig()),
     }
     truth = next(iter(goal.place_set.questions.values()))
     at_home: FloatArray | None = None
-    for name, (school, strategy) in methods.items():
-        config = VocabularyConfig(strategy=strategy, scoring=scoring)
-        index: PlaceIndex[int] = PlaceIndex(config, np.random.default_rng(SEED))
+    for name, (school, config) in methods.items():
+        index = PlaceIndex[int](config.model_copy(update={"scoring": scoring}), np.random.default_rng(SEED))
         index.train(school.places)
         scores = index_scores(index, goal)
         found = recall_at(scores, truth, 1)

@@ -125,15 +125,21 @@ def make_index(method: str, warm_up: Any = None) -> Any:
     from fcslam.places.index import PlaceIndex
     from fcslam.places.vocabulary import Scoring, Strategy, TreeConfig, VocabularyConfig
 
-    configs = {
-        "incremental": VocabularyConfig(),
-        "static": VocabularyConfig(
-            strategy=Strategy.STATIC, scoring=Scoring.WORDS, train_batch=298, tree=TreeConfig(branching=10, depth=5)
-        ),
-    }
-    index: Any = (
-        BruteForce() if method == "brute force" else PlaceIndex[int](configs[method], np.random.default_rng(SEED))
+    class FixedIndex(PlaceIndex[int]):
+        """Trained once, on the first 300 places."""
+
+        def add(self, place: int, descriptors: Any) -> None:
+            super().add(place, descriptors)
+            if len(self) == 300:
+                self.train([self.descriptors(number) for number in range(300)])
+
+    fixed = VocabularyConfig(
+        strategy=Strategy.REBUILD, scoring=Scoring.WORDS, train_batch=10**9, tree=TreeConfig(branching=10, depth=5)
     )
+    rng = np.random.default_rng(SEED)
+    index: Any = BruteForce()
+    if method != "brute force":
+        index = FixedIndex(fixed, rng) if method == "static" else PlaceIndex[int](VocabularyConfig(), rng)
     for number, place in enumerate([] if warm_up is None else warm_up[:320]):
         index.query(place, 1)
         index.add(number, place)

@@ -132,7 +132,7 @@ def draw_vocabulary(run_folder: Path) -> Figure:
     packets = read_mission(run_folder / MISSION).in_order
     places = [sized.packet.body for sized in packets if isinstance(sized.packet.body, Place)]
     figure, (axes,) = sheet(6.5, 3.0, 1)
-    for strategy, color in ((Strategy.STATIC, INK), (Strategy.REBUILD, OTHER), (Strategy.INCREMENTAL, ACCENT)):
+    for strategy, color in ((Strategy.REBUILD, OTHER), (Strategy.INCREMENTAL, ACCENT)):
         settings = VocabularyConfig(strategy=strategy, train_batch=8, capacity=8, leaf_capacity=64)
         index: PlaceIndex[int] = PlaceIndex(settings, np.random.default_rng(0))
         counts = []

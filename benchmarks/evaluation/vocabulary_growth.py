@@ -31,8 +31,6 @@ BATCH: Final = 40
 """Places of a batch."""
 DISTRACTORS: Final = 8
 """Wrong places of a probe group."""
-WINDOW_BATCHES: Final = 5
-"""Batches between two trainings of the strategy ``windowed``."""
 MEASURES: Final = (
     "significance",
     "relative significance",
@@ -146,7 +144,7 @@ def grow_vocabulary(
 ) -> Growth:
     """Add the places in whole batches and measure after each."""
     # Places count from 0: with this L, the first training happens at the last place of the first batch.
-    timing = {"strategy": strategy, "train_batch": BATCH - 2, "rebuild_every": WINDOW_BATCHES * BATCH}
+    timing = {"strategy": strategy, "train_batch": BATCH - 2}
     index: PlaceIndex[str] = PlaceIndex(config.model_copy(update=timing), np.random.default_rng(seed))
     updates = len(arrivals) // BATCH
     _compile(index, arrivals[0].descriptors)

@@ -20,7 +20,7 @@ from fcslam.cli import main
 from fcslam.features.codes import hamming_matrix
 from fcslam.places.index import PlaceIndex
 from fcslam.places.similarity import similarity
-from fcslam.places.vocabulary import Scoring, Strategy, VocabularyConfig
+from fcslam.places.vocabulary import Scoring, VocabularyConfig
 from tests.benchmarks import place_folders
 
 WORDS = VocabularyConfig(scoring=Scoring.WORDS, train_batch=3)
@@ -63,9 +63,9 @@ def test_the_foreign_tree_scores_as_the_bags_of_two_places(described):
 
 def test_a_stream_is_asked_before_each_place_is_added(described):
     _, tour = described
-    scores = strategy_scorer(WORDS.model_copy(update={"strategy": Strategy.STATIC}), 1)(tour)
+    scores = strategy_scorer(WORDS, 1)(tour)
     assert (scores[~tour.place_set.admitted] == 0.0).all()
-    index = PlaceIndex(WORDS.model_copy(update={"strategy": Strategy.STATIC}), np.random.default_rng(1))
+    index = PlaceIndex(WORDS, np.random.default_rng(1))
     for g in range(31):
         index.add(g, tour.gallery[g].descriptors)
     answers = {found.id: found.similarity for found in index.query(tour.queries[31].descriptors, 100)}
@@ -74,7 +74,7 @@ def test_a_stream_is_asked_before_each_place_is_added(described):
 
 def test_an_index_that_was_trained_elsewhere_finds_places(described):
     split, tour = described
-    index = PlaceIndex(VocabularyConfig(strategy=Strategy.STATIC), np.random.default_rng(1))
+    index = PlaceIndex(VocabularyConfig(), np.random.default_rng(1))
     index.train([place.descriptors for place in tour.gallery])
     (truth,) = split.place_set.questions.values()
     assert recall_at(index_scores(index, split), truth, 1).tolist() == [1.0] * 5

@@ -107,13 +107,6 @@ def test_a_checkpoint_of_other_settings_is_refused_but_more_steps_are_not(exampl
     assert more.step == 7
 
 
-def test_validation_draws_no_more_pairs_than_wanted(examples):
-    assert len(validation_pairs(examples)) == 3
-    first, last = validation_pairs(examples * 2, 2)
-    np.testing.assert_array_equal(first.views[0].image, validation_pairs(examples[:1])[0].views[0].image)
-    assert not np.array_equal(first.views[0].image, last.views[0].image)
-
-
 @pytest.mark.slow
 def test_collapsed_codes_sound_the_alarm(examples):
     network = KeypointNetwork("light").eval()

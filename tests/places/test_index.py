@@ -30,7 +30,7 @@ def random_places(rng, count, size=60):
 
 
 def config(strategy, scoring=Scoring.MATCHES, **others):
-    chosen = {"train_batch": 3, "capacity": 30, "rebuild_every": 4, "leaf_capacity": 16, "tree": SMALL}
+    chosen = {"train_batch": 3, "capacity": 30, "leaf_capacity": 16, "tree": SMALL}
     return VocabularyConfig(strategy=strategy, scoring=scoring, **{**chosen, **others})
 
 
@@ -278,33 +278,27 @@ def test_algorithm_1_trains_at_every_place_after_the_first_L_on_the_last_C():
 
 
 def test_the_window_is_the_last_C_places():
-    """Places before it have no influence on the tree."""
+    """Places before it have no influence on the words."""
     places = random_places(np.random.default_rng(7), 20)
-    trees = []
+    words = []
     for start in (0, 8):
-        index = PlaceIndex[int](config(Strategy.STATIC, train_batch=18 - start, capacity=6), np.random.default_rng(1))
+        index = PlaceIndex[int](config(Strategy.REBUILD, train_batch=18 - start, capacity=6), np.random.default_rng(1))
         for number in range(start, 20):
             index.add(number, places[number])
-        trees.append(index._vocabulary.tree.centres.tobytes())
-    assert trees[0] == trees[1]
+        words.append([index.bag(place).words.tolist() for place in places])
+    assert words[0] == words[1]
 
 
-def test_windowed_keeps_the_vocabulary_in_between_and_static_for_ever():
-    assert [version for _, version in trained_on(Strategy.WINDOWED, 14)] == [0] * 4 + [1] * 4 + [2] * 4 + [3] * 2
-    assert [version for _, version in trained_on(Strategy.STATIC, 14)] == [0] * 4 + [1] * 10
-
-
-def test_a_vocabulary_of_other_places_stays_where_it_is_static_and_follows_where_it_is_incremental():
+def test_an_incremental_vocabulary_of_other_places_follows_those_that_arrive():
     foreign, own = random_places(np.random.default_rng(4), 10), random_places(np.random.default_rng(5), 60)
-    for strategy, follows in ((Strategy.STATIC, False), (Strategy.INCREMENTAL, True)):
-        index = PlaceIndex[int](config(strategy), np.random.default_rng(0))
-        index.train(foreign)
-        before = index.word_count
-        for number, place in enumerate(own):
-            index.add(number, place)
-        assert (index.word_count > before) is follows
-        assert index.training.places == 10
-        check_stored(index, dict(enumerate(own)))
+    index = PlaceIndex[int](config(Strategy.INCREMENTAL), np.random.default_rng(0))
+    index.train(foreign)
+    before = index.word_count
+    for number, place in enumerate(own):
+        index.add(number, place)
+    assert index.word_count > before
+    assert index.training.places == 10
+    check_stored(index, dict(enumerate(own)))
 
 
 def test_words_stay_under_their_capacity_and_all_others_stay_as_they_are():

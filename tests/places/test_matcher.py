@@ -203,7 +203,7 @@ def test_the_same_places_give_the_same_matches(visits):
 
 def test_in_a_joint_map_what_looks_most_alike_is_still_compared(visits):
     """The map may be wrong: likeness, not nearness, chooses whom to doubt it with; its own places do not count."""
-    small = VocabularyConfig(train_batch=1, rebuild_every=1)
+    small = VocabularyConfig(train_batch=1)
     matcher = visits.matcher(vocabulary=small)
     matcher.match(visits.visit("a", 0, other_room(), (0.5, 0.5, 1.0)), {}, FRIENDS)
     matcher.match(visits.visit("a", 1, room(), POSE_A), {}, FRIENDS)

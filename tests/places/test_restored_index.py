@@ -19,7 +19,7 @@ def places(seed=0):
 
 def filled(strategy=Strategy.INCREMENTAL, scoring=Scoring.WORDS):
     config = VocabularyConfig(
-        strategy=strategy, scoring=scoring, train_batch=4, leaf_capacity=16, rebuild_every=7,
+        strategy=strategy, scoring=scoring, train_batch=4, leaf_capacity=16,
         tree=TreeConfig(branching=4),
     )  # fmt: skip
     index = PlaceIndex[KeyscanId](config, np.random.default_rng(2))

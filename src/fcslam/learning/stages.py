@@ -73,7 +73,6 @@ def train_detector(
     options: ExecutionOptions,
     teacher: Path | None,
     on_progress: StageCallback,
-    most_images: int | None = None,
     start: KeypointNetwork | None = None,
 ) -> tuple[KeypointNetwork, TrainingImages]:
     """Train on the images below ``roots``.
@@ -84,16 +83,13 @@ def train_detector(
         settings, options: of the run.
         teacher: folder of a teacher's files; None without a teacher.
         on_progress: called after every step.
-        most_images: train on the first ones alone; None for all.
         start: trained network from which training starts; None to start anew.
 
     Returns:
         The trained network, and the images that it was trained on.
     """
     own = folder.resolve()
-    found = read_images(
-        [file for file in find_images(roots) if not file.path.resolve().is_relative_to(own)], most_images
-    )
+    found = read_images([file for file in find_images(roots) if not file.path.resolve().is_relative_to(own)])
     labeller = None if start is None else keypoint_response(start.to(options.device), torch.device(options.device))
     images = label_images(found, folder / "labels", settings, labeller, teacher, partial(on_progress, "labels"))
     key, state = images.checksum(), None
@@ -104,25 +100,17 @@ def train_detector(
     return run.train(images.train, images.held_out, bits, partial(on_progress, "joint")), images
 
 
-def read_images(files: Sequence[ImageFile], most: int | None = None) -> FoundImages:
-    """Read images; ends with the last of the ``most`` ones to train on. None for all."""
-    found: list[tuple[ImageFile, GreyImage]] = []
-    train = skipped = 0
-    for file in files:
-        image = read_image(file.path)
-        if image is None or not is_usable(image):
-            skipped += 1
-            continue
-        found.append((file, image))
-        train += not is_held_out(file.name)
-        if train == most:
-            break
+def read_images(files: Sequence[ImageFile]) -> FoundImages:
+    """Read the images that can be trained on."""
+    read = ((file, read_image(file.path)) for file in files)
+    found = [(file, image) for file, image in read if image is not None and is_usable(image)]
+    train = sum(not is_held_out(file.name) for file, _ in found)
     if train < FEWEST_IMAGES:
         raise InputError(
             f"only {train} of {len(files)} image files can be trained on: the others are not images, smaller than "
             "96 px or have too few corners; give more images"
         )
-    return found, skipped
+    return found, len(files) - len(found)
 
 
 def label_images(

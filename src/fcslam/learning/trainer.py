@@ -28,7 +28,7 @@ from fcslam.learning.training_loop import (
     restore_optimizer_state,
     step_losses,
 )
-from fcslam.learning.validation import VALIDATION_PAIRS, collapse_warnings, validate, validation_pairs
+from fcslam.learning.validation import collapse_warnings, validate, validation_pairs
 from fcslam.storage.state_file import State, read_state, write_state
 
 AVERAGE_DECAY: Final = 0.999
@@ -46,8 +46,6 @@ class ExecutionOptions:
     """Steps between two validations."""
     checkpoint_every_s: float = 120.0
     """Time between two checkpoints."""
-    validation_pairs: int = VALIDATION_PAIRS
-    """Most pairs of held-out images in a validation."""
     log_every: int = 50
     """Steps between two rows of losses in the log."""
     threads: int = 1
@@ -110,7 +108,7 @@ class TrainingRun:
             self.folder.mkdir(parents=True, exist_ok=True)
         self._resume()
         bits = None if bits is None else on_device(bits, self.device)
-        views = validation_pairs(held_out, options.validation_pairs)
+        views = validation_pairs(held_out)
         metrics: dict[str, float] = {}
         warnings: tuple[str, ...] = ()
         steps = range(self.step, settings.steps)

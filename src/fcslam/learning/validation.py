@@ -33,10 +33,10 @@ LARGEST_BIAS: Final = 0.25
 """Bits whose mean is farther from a half than this carry little information."""
 
 
-def validation_pairs(held_out: Sequence[TrainingExample], most: int = VALIDATION_PAIRS) -> list[ViewPair]:
-    """At most ``most`` pairs of views of held-out images, spread over all of them; always the same."""
+def validation_pairs(held_out: Sequence[TrainingExample]) -> list[ViewPair]:
+    """Pairs of views of held-out images, spread over all of them; always the same."""
     pairs = []
-    count = min(most, len(held_out))
+    count = min(VALIDATION_PAIRS, len(held_out))
     for index in range(count):
         rng = np.random.default_rng([2026, index])
         example = held_out[index * len(held_out) // count]

@@ -232,14 +232,8 @@ class PlaceIndex(Generic[PlaceId]):
 
     def _is_due(self, i: int) -> bool:
         """Algorithm 1, line 4: whether the tree is trained after place i."""
-        since = i - self._config.train_batch - 1
-        match self._config.strategy:
-            case Strategy.REBUILD:
-                return since >= 0
-            case Strategy.WINDOWED:
-                return since >= 0 and since % self._config.rebuild_every == 0
-            case _:
-                return since >= 0 and self._training is None
+        is_repeated = self._config.strategy is Strategy.REBUILD
+        return i > self._config.train_batch and (is_repeated or self._training is None)
 
     def _train_on_newest(self) -> None:
         """Algorithm 1, lines 5-9. Its two cases are one window here: D_max(0, i - C + 1) ... D_i."""

@@ -21,9 +21,7 @@ from fcslam.places.postings import GROWTH_FACTOR, grown_rows
 class Strategy(StrEnum):
     """When the vocabulary changes."""
 
-    STATIC = "static"
     REBUILD = "rebuild"
-    WINDOWED = "windowed"
     INCREMENTAL = "incremental"
 
 
@@ -59,17 +57,14 @@ class VocabularyConfig(Settings):
 
     strategy: Strategy = Field(
         default=Strategy.INCREMENTAL,
-        description="when the vocabulary is trained. static: once; rebuild: at every place; windowed: at every "
-        "rebuild_every-th place; incremental: once, then words split as they fill",
+        description="when the vocabulary is trained. rebuild: at every place; incremental: once, then words split as "
+        "they fill",
     )
     train_batch: int = Field(
         default=20, ge=0, description="places before the first training of the vocabulary (L of Algorithm 1)"
     )
     capacity: int = Field(
         default=300, ge=1, description="newest places that the vocabulary is trained on (C of Algorithm 1)"
-    )
-    rebuild_every: int = Field(
-        default=20, ge=1, description="places between two trainings of the vocabulary, strategy windowed"
     )
     tree: TreeConfig = Field(default=TreeConfig(), description="shape of the vocabulary tree when it is trained")
     leaf_capacity: int = Field(

@@ -83,11 +83,6 @@ def test_labels_stay_those_of_the_first_weights(folder, start, tmp_path):
     assert {file: file.read_bytes() for file in labels_in(tmp_path)} == labels
 
 
-def test_a_robot_labels_no_more_images_than_asked(folder, start, tmp_path):
-    learn(robot(folder, tmp_path, most_images=2), start)
-    assert len(labels_in(tmp_path)) == 2
-
-
 def test_the_optimizer_goes_on_from_the_robots_last_round(folder, start, tmp_path):
     def train(cache, round_number, run="run"):
         return learn(robot(folder, tmp_path / cache), start, round_number, run, settings(rounds=9))

@@ -120,8 +120,6 @@ class ImageClient(RobotClient):
 
     folder: Path | None = None
     """Contains the images; None if they are given."""
-    most_images: int | None = None
-    """It trains on the first ones alone; None for all."""
     images: TrainingImages | None = None
     """The images with their labels; None until they are read."""
     labelled_for: TrainingSettings | None = None
@@ -151,7 +149,7 @@ class ImageClient(RobotClient):
             assert self.folder is not None
             device = torch.device(self.device)
             labeller = keypoint_response(weights_to_network(weights, training.encoder).to(device), device)
-            found = read_images(find_images([self.folder]), self.most_images)
+            found = read_images(find_images([self.folder]))
             self.images = label_images(found, self.cache, training, labeller)
             self.labelled_for = training
         return self.images

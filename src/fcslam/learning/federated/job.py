@@ -107,12 +107,11 @@ def federate_locally(
     job: FederatedJob,
     on_round: Callable[[RoundReport], None] = lambda _report: None,
     on_step: Callable[[str, int], None] = lambda _robot, _steps: None,
-    most_images: int | None = None,
 ) -> list[Path]:
     """Run or continue federated training; returns the files for the user, see ``run_job``.
 
-    ``folders`` hold the images of each robot, which has the name of its folder. It trains on its first ``most_images``
-    alone; None for all. ``on_step`` is called with a robot's name and the steps that it has done in the round.
+    ``folders`` hold the images of each robot, which has the name of its folder. ``on_step`` is called with a robot's
+    name and the steps that it has done in the round.
     """
     names = [folder.resolve().name for folder in folders]
     twice = {name for name in names if names.count(name) > 1}
@@ -122,7 +121,7 @@ def federate_locally(
         if not folder.is_dir():
             raise InputError(f"{folder}: is not a folder; give one folder of images for each robot")
     clients = {
-        name: ImageClient(name, job.output / "robots" / name, job.device, on_step, folder, most_images)
+        name: ImageClient(name, job.output / "robots" / name, job.device, on_step, folder)
         for name, folder in zip(names, folders, strict=True)
     }
 
