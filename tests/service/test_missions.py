@@ -78,7 +78,7 @@ def test_a_mission_without_its_file_is_not_a_new_one(service, harm):
     if harm == "empty":
         folder.store.touch()
     with pytest.raises(StoreError, match="is missing or empty; put its backup in its place"):
-        missions._opened("mission")
+        missions.create("mission") if harm == "gone" else missions.open("mission")
     assert missions.open_mission.folder.name == "next"
 
 

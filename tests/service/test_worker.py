@@ -15,18 +15,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fcslam.cloud.fleet import Fleet
-from fcslam.maps import certificate
-from fcslam.maps.certificate import certify
+from fcslam.cloud.host import FleetHost
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.mission.mission_store import MissionStore, StoredPacket
 from fcslam.records import ClosureStatus, FloorLabel, Place, Removal, Undo, Veto
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
-from fcslam.service import worker as worker_module
+from fcslam.service.joint_maps import read_joint_maps
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import PROGRESS
-from fcslam.service.worker import AT_ONCE, MOST_CRASHES, SNAPSHOT_EVERY_S, Worker
+from fcslam.service.worker import AT_ONCE, MOST_CRASHES, QUALITY_EVERY_S, SNAPSHOT_EVERY_S, Worker
 from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, read_label
@@ -52,7 +50,7 @@ def sent(source, config):
 
 
 class Cloud:
-    """A store and a worker over it, as often as it is restarted; its clock moves by a second a look."""
+    """A store and a worker over it, as often as it is restarted; its clock moves by ``tick`` a look."""
 
     def __init__(self, path, config=None):
         self.folder = MissionFolder(path)
@@ -60,14 +58,15 @@ class Cloud:
         self.store = MissionStore(self.folder.store)
         if config:
             self.store.configure(config)
-        self.now, self.told = 0.0, []
+        self.now, self.told, self.tick = 0.0, [], 1.0
         self.restart()
 
-    def restart(self):
-        self.worker = Worker(self.folder, self.store, self.clock, lambda *told: self.told.append(told), InlineTask)
+    def restart(self, make_host=FleetHost):
+        told = lambda *event: self.told.append(event)  # noqa: E731
+        self.worker = Worker(self.folder, self.store, self.clock, told, InlineTask, make_host=make_host)
 
     def clock(self):
-        self.now += 1.0
+        self.now += self.tick
         return self.now
 
     def put(self, packets):
@@ -176,31 +175,28 @@ def test_a_worker_says_nothing_old_while_it_catches_up(cloud):
     assert open_run(cloud.folder.live).pose_graph_g2o == open_run(live).pose_graph_g2o
 
 
-def counted(cloud, monkeypatch):
-    """The packets that fleets apply from now on."""
-    fleet, applied = Fleet, []
-    apply = fleet.apply
+def hosts(before):
+    """Hosts of fleets that call this with each packet before they apply it."""
 
-    def counting(self, packet):
-        applied.append((packet.robot, packet.sequence))
-        apply(self, packet)
+    class Watched(FleetHost):
+        def apply_next(self, number, packet):
+            before(packet)
+            super().apply_next(number, packet)
 
-    monkeypatch.setattr(fleet, "apply", counting)
-    return applied
+    return Watched
 
 
-def test_a_worker_goes_on_from_its_snapshot_with_the_same_result(cloud, monkeypatch):
+def test_a_worker_goes_on_from_its_snapshot_with_the_same_result(cloud):
     packets, whole = two_robots(), expected()
     cut = (AT_ONCE + len(packets)) // 2
     cloud.put(packets[:cut])
     cloud.work()
     cloud.now += SNAPSHOT_EVERY_S
     cloud.work()
-    applied = counted(cloud, monkeypatch)
-    cloud.restart()
+    applied = []
+    cloud.restart(hosts(lambda packet: applied.append((packet.robot, packet.sequence))))
     cloud.put(packets[cut:])
     cloud.work()
-    assert applied == [(packet.robot, packet.sequence) for packet in packets[cut:]]
     run = cloud.finalize()
     assert applied == [(packet.robot, packet.sequence) for packet in packets[cut:]], "no packet twice"
     assert content(run) == whole
@@ -212,21 +208,25 @@ def test_when_robots_were_heard_survives_a_restart_and_a_replay_is_not_hearing_t
     cloud.work()
     cloud.now += SNAPSHOT_EVERY_S
     cloud.work()
-    heard = cloud.worker._heard
-    assert set(heard) == {("a", 0), ("b", 0)}
+    assert heard(cloud) == {"a": True, "b": True}
     cloud.restart()
-    assert cloud.worker._heard == heard
+    assert heard(cloud) == {"a": True, "b": True}
     cloud.folder.snapshot.unlink()
     cloud.restart()
-    cloud.work()
-    assert cloud.worker._heard == {}
+    assert heard(cloud) == {"a": False, "b": False}
     cloud.put(packets[-1:])
+    assert heard(cloud) == {"a": False, "b": False, packets[-1].robot: True}
+
+
+def heard(cloud):
+    """Whether it is known when each robot was heard, as the joint maps say."""
+    cloud.now += 60.0
     cloud.work()
-    assert set(cloud.worker._heard) == {(packets[-1].robot, 0)}
+    return {one.robot: one.heard_s > 0.0 for one in read_joint_maps(cloud.folder.joint_maps).sessions}
 
 
-@pytest.mark.parametrize("fault", ["damage", "other packets", "other program"])
-def test_a_snapshot_that_does_not_fit_is_ignored_with_one_line(cloud, monkeypatch, tmp_path, caplog, fault):
+@pytest.mark.parametrize("fault", ["damage", "other packets"])
+def test_a_snapshot_that_does_not_fit_is_ignored_with_one_line(cloud, tmp_path, caplog, fault):
     packets = two_robots()
     cloud.put(packets)
     expected = cloud.finalize()
@@ -237,16 +237,14 @@ def test_a_snapshot_that_does_not_fit_is_ignored_with_one_line(cloud, monkeypatc
         data = bytearray(cloud.folder.snapshot.read_bytes())
         data[len(data) // 2] ^= 4
         cloud.folder.snapshot.write_bytes(data)
-    elif fault == "other packets":
+    else:
         other = Cloud(tmp_path / "other")
         other.put([*packets[:-2], packets[-1], packets[-2]])
         cloud.folder.snapshot.rename(other.folder.snapshot)
         cloud.store.close()
         cloud.store, cloud.folder = other.store, other.folder
-    else:
-        monkeypatch.setattr(worker_module, "code_version", lambda: "another one")
-    applied = counted(cloud, monkeypatch)
-    cloud.restart()
+    applied = []
+    cloud.restart(hosts(applied.append))
     (line,) = [record.getMessage() for record in caplog.records]
     assert str(cloud.folder.snapshot) in line
     assert "applies all packets again" in line
@@ -254,34 +252,13 @@ def test_a_snapshot_that_does_not_fit_is_ignored_with_one_line(cloud, monkeypatc
     assert len(applied) >= len(packets)
 
 
-def test_packets_come_before_the_keyscans_that_the_live_map_needs_after_a_restart(cloud, monkeypatch):
-    packets = two_robots()
-    cloud.put(packets[:-1])
-    cloud.work()
-    cloud.now += 60.0
-    cloud.work()
-    cloud.restart()
-    read = []
-    decode = worker_module.decode
-    monkeypatch.setattr(worker_module, "decode", lambda data: read.append(data) or decode(data))
-    monkeypatch.setattr(worker_module, "AT_ONCE", 20)
-    cloud.worker.step()
-    assert len(read) == 20
-    cloud.put(packets[-1:])
-    cloud.worker.step()
-    assert cloud.store.applied() == len(packets)
-    assert len(read) == 20 + 1
-    cloud.work()
-    assert len(read) == len(set(read)) == 2 * len(POSES) + 1, "no keyscan twice"
-
-
-def test_a_worker_that_is_killed_while_it_catches_up_does_not_begin_again(cloud, monkeypatch):
+def test_a_worker_that_is_killed_while_it_catches_up_does_not_begin_again(cloud):
     cloud.put(two_robots())
     for _ in range(AT_ONCE + 1):
         cloud.worker.step()
     assert cloud.store.applied() < len(two_robots())
-    applied = counted(cloud, monkeypatch)
-    cloud.restart()
+    applied = []
+    cloud.restart(hosts(applied.append))
     cloud.work()
     assert len(applied) <= len(two_robots()) - AT_ONCE
 
@@ -300,18 +277,15 @@ def test_a_packet_that_does_not_fit_is_refused_with_its_reason_and_the_session_g
     assert cloud.finalize().pose_graph_g2o == run.pose_graph_g2o
 
 
-def test_a_packet_that_breaks_the_worker_breaks_only_the_first_one(cloud, monkeypatch):
+def test_a_packet_that_breaks_the_worker_breaks_only_the_first_one(cloud):
     packets = stream("a", POSES, start_s=0.0)
     cloud.put(packets)
-    fleet = Fleet
-    apply = fleet.apply
 
-    def fragile(self, packet):
+    def fragile(packet):
         if encode(packet) == encode(packets[-1]):
             raise ZeroDivisionError("oh")
-        apply(self, packet)
 
-    monkeypatch.setattr(fleet, "apply", fragile)
+    cloud.restart(hosts(fragile))
     with pytest.raises(ZeroDivisionError):
         cloud.work()
     cloud.restart()
@@ -332,29 +306,14 @@ def test_corrections_leave_while_there_is_still_a_queue(cloud):
     assert each == list(range(waiting[0], -1, -1)), "a packet takes longer than a look here: each is a step"
 
 
-def test_a_quick_worker_looks_after_a_number_of_packets_all_the_same(cloud, monkeypatch):
+def test_a_quick_worker_looks_after_a_number_of_packets_all_the_same(cloud):
     cloud.put(two_robots())
-    monkeypatch.setattr(cloud.worker, "_clock", lambda: 0.0)
+    cloud.tick = 0.0
     cloud.worker.step()
     assert cloud.store.applied() == AT_ONCE < len(cloud.store.envelopes())
 
 
-def test_a_packet_that_there_is_no_memory_for_is_not_refused(cloud, monkeypatch):
-    cloud.put(stream("a", POSES, start_s=0.0))
-
-    def hungry(self, packet):
-        raise MemoryError
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Fleet, "apply", hungry)
-        with pytest.raises(MemoryError):
-            cloud.work()
-    assert cloud.store.refusals("a") == []
-    cloud.restart()
-    assert len(cloud.finalize().trajectories["a"].stamps) == len(POSES)
-
-
-def test_a_packet_that_ends_worker_after_worker_is_refused_and_the_mission_goes_on(cloud, monkeypatch, tmp_path):
+def test_a_packet_that_ends_worker_after_worker_is_refused_and_the_mission_goes_on(cloud, tmp_path):
     packets = two_robots()
     bad = next(k for k, packet in enumerate(packets) if k > 70 and isinstance(packet.body, Place))
     reference = Cloud(tmp_path / "reference")
@@ -362,70 +321,63 @@ def test_a_packet_that_ends_worker_after_worker_is_refused_and_the_mission_goes_
     reference.store.refuse(packets[bad].robot, 0, packets[bad].sequence, "beforehand")
     expected = content(reference.finalize())
     reference.store.close()
-    fleet = Fleet
-    apply = fleet.apply
 
-    def hungry(self, packet):
+    def hungry(packet):
         if packet.sequence == packets[bad].sequence and packet.robot == packets[bad].robot:
             raise MemoryError
-        apply(self, packet)
 
-    monkeypatch.setattr(fleet, "apply", hungry)
     cloud.put(packets)
     for _ in range(MOST_CRASHES):
+        cloud.restart(hosts(hungry))
         with pytest.raises(MemoryError):
             cloud.work()
-        assert cloud.store.refusals(packets[bad].robot) == []
-        cloud.restart()
+        assert cloud.store.refusals(packets[bad].robot) == [], "there may be memory for it later"
+    cloud.restart()
     run = cloud.finalize()
     ((_, sequence, reason),) = cloud.store.refusals(packets[bad].robot)
     assert (sequence, reason) == (packets[bad].sequence, "3 workers in a row ended while they applied it")
     assert content(run) == expected
 
 
-def test_workers_that_end_elsewhere_refuse_nothing(cloud, monkeypatch):
+def test_workers_that_end_elsewhere_refuse_nothing(cloud):
     """Killed at a packet, then at another one, and so on: no packet is to blame."""
     cloud.put(two_robots())
-    fleet, ends = Fleet, iter([20, 30, 20, 30, 40])
-    apply, left = fleet.apply, [next(ends)]
+    for left in (20, 30, 20, 30, 40):
+        applied = []
 
-    def fragile(self, packet):
-        left[0] -= 1
-        if left[0] == 0:
-            raise MemoryError
-        apply(self, packet)
+        def fragile(packet, applied=applied, left=left):
+            applied.append(packet)
+            if len(applied) == left:
+                raise MemoryError
 
-    monkeypatch.setattr(fleet, "apply", fragile)
-    for end in ends:
+        cloud.restart(hosts(fragile))
         with pytest.raises(MemoryError):
             cloud.work()
-        cloud.restart()
-        left[0] = end
-    left[0] = -1
+    cloud.restart()
     cloud.work()
     assert [cloud.store.refusals(robot) for robot in "ab"] == [[], []]
     assert cloud.store.applied() == len(two_robots())
 
 
-def test_a_result_that_ends_worker_after_worker_fails_and_the_mission_goes_on(cloud, monkeypatch):
-    cloud.put(two_robots())
-    cloud.work()
-
+def test_a_result_that_ends_worker_after_worker_fails_and_the_mission_goes_on(cloud):
     class Killed(BaseException):
         """As by the kernel, which needs the memory."""
 
-    def killed(*_):
-        raise Killed
+    class Killing(FleetHost):
+        def conclude(self, _):
+            raise Killed
 
+    cloud.put(two_robots())
+    cloud.work()
     number = cloud.store.ask_to_finalize()
-    with monkeypatch.context() as patched:
-        patched.setattr(Worker, "_result", killed)
-        for _ in range(MOST_CRASHES):
-            with pytest.raises(Killed):
-                cloud.work()
-            cloud.restart()
-        cloud.work()
+    for _ in range(MOST_CRASHES):
+        cloud.restart(Killing)
+        with pytest.raises(Killed):
+            cloud.work()
+    cloud.restart(Killing)
+    cloud.work()
     assert "3 workers in a row" in cloud.store.finalization(number).failure
+    cloud.restart()
     assert len(cloud.finalize().trajectories) == 2
 
 
@@ -436,10 +388,9 @@ def test_a_packet_refused_while_it_waits_is_not_applied_after_a_restart(cloud):
     cloud.now += 60.0
     cloud.work()
     cloud.store.refuse("a", 0, packets[-1].sequence, "by hand")
-    cloud.restart()
-    cloud.put(packets[-2:-1])
     applied = []
-    cloud.worker._host.fleet.apply = applied.append
+    cloud.restart(hosts(applied.append))
+    cloud.put(packets[-2:-1])
     cloud.work()
     assert cloud.store.applied() == len(packets)
     assert [packet.sequence for packet in applied] == [packets[-2].sequence]
@@ -567,22 +518,19 @@ def test_the_live_run_follows_and_is_always_whole(cloud):
     assert len(list((cloud.folder.path / "snapshots").iterdir())) <= 2
 
 
-def test_the_live_run_has_a_certificate_which_is_computed_seldom_or_when_maps_join(cloud, monkeypatch):
-    certified = []
-    monkeypatch.setattr(worker_module, "QUALITY_EVERY_S", 500.0)  # the clock moves at every look
-    monkeypatch.setattr(certificate, "certify", lambda *given: certified.append(cloud.now) or certify(*given))
-    packets = two_robots()
-    parts = np.array_split(np.arange(len(packets)), len(packets) // 4)
-    for part in parts:
+def test_the_live_run_has_a_certificate_which_is_computed_seldom_or_when_maps_join(cloud):
+    packets, certificates = two_robots(), []
+    cloud.tick = 0.001
+    for part in np.array_split(np.arange(len(packets)), len(packets) // 4):
         cloud.put([packets[k] for k in part])
         cloud.now += 8.0
         cloud.work()
         live = open_run(cloud.folder.live)
-        assert ("quality.json" in live.quality) == any(len(t.stamps) for t in live.trajectories.values())
-    assert 2 <= len(certified) < len(parts) / 3
-    apart_s = np.diff(certified)
-    early = (apart_s > 0.0) & (apart_s < worker_module.QUALITY_EVERY_S)  # 0 s: two maps at once
-    assert early.sum() <= 2, "b begins, and the maps join"
+        if any(len(t.stamps) for t in live.trajectories.values()):
+            certificates.append((cloud.now, live.quality["quality.json"]))
+    computed = [at for (at, one), (_, before) in zip(certificates[1:], certificates, strict=False) if one != before]
+    assert 2 <= len(computed) < len(certificates) / 2
+    assert sum(np.diff(computed) < QUALITY_EVERY_S - 8.0) <= 2, "b begins, and the maps join"
     assert set(json.loads(live.quality["quality.json"])) == {"0"}
 
 
@@ -664,17 +612,16 @@ def test_corrections_number_maps_as_the_live_run_does(cloud):
     assert told == {"a": 0, "b": 0, "c": 1, "d": 2}
 
 
-def test_a_result_or_live_map_that_fails_stops_nothing(cloud, monkeypatch, caplog):
-    def broken(self, *_, **__):
-        raise ValueError("a pose is not finite")
+def test_a_result_that_fails_stops_nothing(cloud):
+    class Broken(FleetHost):
+        def conclude(self, _):
+            raise ValueError("a pose is not finite")
 
-    with monkeypatch.context() as patched:
-        patched.setattr(Worker, "_run", broken)
-        cloud.put(two_robots())
-        number = cloud.store.ask_to_finalize()
-        cloud.work()
+    cloud.restart(Broken)
+    cloud.put(two_robots())
+    number = cloud.store.ask_to_finalize()
+    cloud.work()
     assert cloud.store.finalization(number).failure == "a pose is not finite"
-    assert "the live map cannot be written: ValueError" in caplog.text
-    cloud.now += 1000.0
+    cloud.restart()
     assert len(cloud.finalize().trajectories) == 2
     assert cloud.folder.live.exists()

@@ -135,10 +135,13 @@ class Intake:
         announced: Callable[[], Mapping[Channel, DetectorFile]] = dict,
         limits: ClaimLimits | None = None,
         agents: "Agents | None" = None,
+        longest_queue: int = LONGEST_QUEUE,
+        most_early: int = MOST_EARLY,
     ) -> None:
         """``announced``: detectors that robots are to use; ``limits``: what a robot may send; ``agents``: who speaks
         for the robots, if other instances know that as well.
         """
+        self._longest_queue, self._most_early = longest_queue, most_early
         self._limits = limits = limits or ClaimLimits()
         burst = max(20.0 * limits.packets_per_s, MAXIMUM_BATCH_PACKETS)  # those of 20 s
         self._packet_rate = TokenBuckets(clock, limits.packets_per_s, burst)
@@ -227,18 +230,18 @@ class Intake:
     def _make_room(self, robot: str, numbers: Sequence[tuple[str, int, int]]) -> None:
         """Refuse, for now, what would make the queue or the robot's waiting packets too many."""
         queue = self.ready_count() - self._store.applied()
-        if queue > LONGEST_QUEUE:
+        if queue > self._longest_queue:
             raise BusyError(f"{queue} packets have not taken effect yet; send these again later")
         with self._lock:
             for _, epoch, sequence in numbers:
                 first = self._log.next_sequence(session_name(robot, epoch))
-                if sequence > first + MOST_EARLY:
+                if sequence > first + self._most_early:
                     raise BusyError(f"{robot}: packet {sequence} is far ahead; send packet {first} first")
             early = self._log.would_wait(PacketNumber(session_name(robot, epoch), k) for _, epoch, k in numbers)
-        if early and self.waiting_count(robot) + len(early) > MOST_EARLY:
+        if early and self.waiting_count(robot) + len(early) > self._most_early:
             session = early[0].session
             raise BusyError(
-                f"{robot}: over {MOST_EARLY} packets wait for one before them; "
+                f"{robot}: over {self._most_early} packets wait for one before them; "
                 f"send packet {self._log.next_sequence(session)} of epoch {robot_and_epoch(session)[1]} first"
             )
 

@@ -96,6 +96,7 @@ class Worker:
         start: Start,
         verify_pairs: VerifyPairs = verify_here,
         share: Share = lambda *_: None,
+        make_host: Callable[[CloudConfig, Callable[[PacketNumber], Packet], VerifyPairs], FleetHost] = FleetHost,
     ) -> None:
         config = store.fact(CONFIG)
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
@@ -104,7 +105,7 @@ class Worker:
         self._crashes = CrashLog(folder.worker_task)
         self._ready: deque[StoredPacket] = deque()
         """Packets that may take effect and did not yet."""
-        self._host = FleetHost(self._config, self._read, verify_pairs)
+        self._host = make_host(self._config, self._read, verify_pairs)
         self._arrivals = 0
         """How many packets were read."""
         self._read_hash = b""

@@ -20,6 +20,7 @@ from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.state import EventStream, ServiceState
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import Missions
+from fcslam.service.supervisor import PROGRESS
 from fcslam.service.worker import Worker
 from fcslam.wire.batches import MEDIA_TYPE, read_batch, write_batch
 from fcslam.wire.packets import decode, encode
@@ -53,11 +54,12 @@ class InlineWorker:
     def __init__(self, folder: MissionFolder) -> None:
         self._now = 0.0
         self._store = MissionStore(folder.store)
-        self._worker = Worker(folder, self._store, lambda: self._now, lambda *_: None, InlineTask)
+        self.applied = 0
+        self._worker = Worker(folder, self._store, lambda: self._now, self._note, InlineTask)
 
-    @property
-    def applied(self) -> int:
-        return self._worker._applied
+    def _note(self, event: str, content: int) -> None:
+        if event == PROGRESS:
+            self.applied = content
 
     def notify(self) -> None:
         self._now += 1000.0

@@ -13,7 +13,7 @@ import pytest
 import uvicorn
 
 from fcslam.service.credentials import make_credentials
-from fcslam.service.http import middleware, protocol
+from fcslam.service.http import middleware
 from fcslam.service.http.middleware import UnauthenticatedLimit
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
 from tests.service.http.desk import A
@@ -67,8 +67,7 @@ def test_requests_without_a_token_wait_for_each_other_and_addresses_take_turns()
     assert len(answered) == 62
 
 
-def test_too_many_waiting_requests_without_a_token_are_refused(monkeypatch):
-    monkeypatch.setattr(middleware, "MOST_WAITING", 2)
+def test_too_many_waiting_requests_without_a_token_are_refused():
     told = []
 
     async def app(scope, receive, send):
@@ -78,7 +77,7 @@ def test_too_many_waiting_requests_without_a_token_are_refused(monkeypatch):
         told.append(message.get("status"))
 
     async def ask():
-        gate = UnauthenticatedLimit(app, lambda _: False)
+        gate = UnauthenticatedLimit(app, lambda _: False, most_waiting=2)
         crowd = (gate({"type": "http", "client": ("x", 1), "state": {}}, None, send) for _ in range(30))
         await asyncio.gather(*crowd)
 
@@ -87,8 +86,7 @@ def test_too_many_waiting_requests_without_a_token_are_refused(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_tls_handshake_that_does_not_come_is_hung_up_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(protocol, "IDLE_S", 1.0)
+def test_a_tls_handshake_that_does_not_come_is_hung_up_on(tmp_path):
     make_credentials(tmp_path, ["127.0.0.1"], {}, datetime.now(UTC))
 
     async def app(scope, receive, send):
@@ -104,7 +102,7 @@ def test_a_tls_handshake_that_does_not_come_is_hung_up_on(tmp_path, monkeypatch)
         ssl_keyfile=tmp_path / "cloud.key",
     )
     listening = socket.create_server(("127.0.0.1", 0))
-    server = GuardedServer(config)
+    server = GuardedServer(config, handshake_s=1.0)
     thread = threading.Thread(target=server.run, args=([listening],))
     thread.start()
     try:

@@ -43,24 +43,19 @@ def wanted(registry, postgres, name):
     return number
 
 
-def instance(postgres, name, room=10, clock=time.monotonic):
+def instance(postgres, name, room=10, clock=time.monotonic, kind=Registry):
     workers = []
 
     def launch(mission, lease):
         workers.append(Started(mission, lease))
         return workers[-1]
 
-    registry = Registry(postgres, name, f"process of {name}")
+    registry = kind(postgres, name, f"process of {name}", LONG_S)
     return Instance(registry, name, room, launch, lambda *_: None, lambda: None, clock), workers
 
 
-EXPIRY = "fcslam.service.shared.registry._EXPIRY"
-
-
-@pytest.fixture(autouse=True)
-def lasting(monkeypatch):
-    """Leases last until a test ends them, however slow the machine is."""
-    monkeypatch.setattr(EXPIRY, "clock_timestamp() + interval '1 hour'")
+LONG_S = 3600.0
+"""Leases last until a test ends them, however slow the machine is."""
 
 
 def end_leases(postgres, name):
@@ -94,12 +89,10 @@ def test_of_two_that_claim_at_once_each_mission_gets_one_worker(registry, postgr
     assert len(claimed) == 20 == len({lease.mission for lease in claimed})
 
 
-def test_a_lease_ends_by_the_servers_clock_and_one_that_is_renewed_does_not(registry, postgres, monkeypatch):
+def test_a_lease_ends_by_the_servers_clock_and_one_that_is_renewed_does_not(registry, postgres):
     for name in ("kept", "lost"):
         wanted(registry, postgres, name)
-    with monkeypatch.context() as patched:
-        patched.setattr(EXPIRY, "clock_timestamp() + interval '0.3 seconds'")
-        kept, lost = sorted(registry.claim(2))
+    kept, lost = sorted(Registry(postgres, "one", "process of one", 0.3).claim(2))
     assert registry.renew([(kept, True)]) == {kept}
     other = Registry(postgres, "other", "process of other")
     taken = []
@@ -108,37 +101,25 @@ def test_a_lease_ends_by_the_servers_clock_and_one_that_is_renewed_does_not(regi
     assert registry.renew([(kept, True), (lost, True)]) == {kept}
 
 
-def test_the_clock_of_an_instance_may_be_wrong_by_minutes(registry, postgres, monkeypatch):
-    number = wanted(registry, postgres, "timed")
-    (lease,) = registry.claim(1)
-    for wrong_s in (-600.0, 600.0):
-        now = time.time() + wrong_s
-        monkeypatch.setattr(time, "time", lambda now=now: now)
-        assert Registry(postgres, "wrong", "process of wrong").claim(9) == []
-        assert registry.renew([(lease, True)]) == {lease}
-        MissionStore(MissionTables(postgres, number, lease)).progress(1, [])
-
-
-def test_after_the_store_was_gone_the_others_may_renew_before_anybody_claims(registry, postgres, monkeypatch):
+def test_after_the_store_was_gone_the_others_may_renew_before_anybody_claims(registry, postgres):
     wanted(registry, postgres, "m")
     (lease,) = registry.claim(1)
-    now, seen = [0.0], []
-    other, workers = instance(postgres, "other", clock=lambda: now[0])
-    is_gone, register = threading.Event(), Registry.register
+    now, seen, is_gone = [0.0], [], threading.Event()
 
-    def failing(self, room):
-        seen.append(is_gone.is_set())
-        if is_gone.is_set():
-            raise StoreError("gone")
-        return register(self, room)
+    class Failing(Registry):
+        def register(self, room):
+            seen.append(is_gone.is_set())
+            if is_gone.is_set():
+                raise StoreError("gone")
+            return super().register(room)
 
-    monkeypatch.setattr(Registry, "register", failing)
+    other, workers = instance(postgres, "other", clock=lambda: now[0], kind=Failing)
     is_gone.set()
     other.start()
-    until(lambda: seen)
+    until(lambda: True in seen)
     end_leases(postgres, "one")
     is_gone.clear()
-    until(lambda: seen.count(False) > 1)
+    until(lambda: seen.count(False) > 2)
     assert not workers
     assert registry.renew([(lease, True)]) == {lease}
     end_leases(postgres, "one")
@@ -147,27 +128,18 @@ def test_after_the_store_was_gone_the_others_may_renew_before_anybody_claims(reg
     other.close()
 
 
-def test_two_instances_of_one_name_are_refused(registry, postgres, monkeypatch):
-    monkeypatch.setattr("fcslam.service.shared.instance.NAME_S", 0.5)
+def test_two_instances_of_one_name_are_refused_until_the_first_is_gone(registry, postgres):
     one, _ = instance(postgres, "same")
-    one.start()
-    again = Registry(postgres, "same", "another process")
+    again = Registry(postgres, "same", "another process", 0.3)
+    nothing = lambda *_: None  # noqa: E731
     with pytest.raises(InputError, match="is called 'same'; stop it, or give this one another --port"):
-        Instance(again, "same", 1, Started, lambda *_: None, lambda: None)
+        Instance(again, "same", 1, nothing, nothing, nothing)
     one.close()
-    Instance(again, "same", 1, Started, lambda *_: None, lambda: None).close()
-
-
-def test_the_name_of_a_killed_instance_is_free_again(registry, postgres, monkeypatch):
-    with monkeypatch.context() as patched:
-        patched.setattr(EXPIRY, "clock_timestamp() + interval '0.3 seconds'")
-        assert Registry(postgres, "killed", "before").register(1)
-    after = Registry(postgres, "killed", "after")
-    Instance(after, "killed", 1, Started, lambda *_: None, lambda: None).close()
+    Instance(again, "same", 1, nothing, nothing, nothing).close()
 
 
 @pytest.mark.slow
-def test_missions_are_spread_and_those_of_an_instance_that_ends_or_dies_are_taken_over(registry, postgres):
+def test_missions_are_spread_and_those_of_an_instance_that_ends_are_taken_over(registry, postgres):
     for k in range(6):
         wanted(registry, postgres, f"m{k}")
     one, of_one = instance(postgres, "one")
@@ -180,9 +152,7 @@ def test_missions_are_spread_and_those_of_an_instance_that_ends_or_dies_are_take
     two.close()
     assert all(worker.is_stopped for worker in of_two)
     until(lambda: list(held(registry).values()) == ["one"] * 6)
-    one._closing.set()  # it dies: nobody renews its leases
-    one._thread.join()
-    end_leases(postgres, "one")
+    one.close()
     three, of_three = instance(postgres, "three")
     three.start()
     until(lambda: list(held(registry).values()) == ["three"] * 6 and len(of_three) == 6)
@@ -195,7 +165,7 @@ def test_an_instance_takes_no_more_missions_than_it_has_room_for(registry, postg
         wanted(registry, postgres, f"m{k}")
     small, of_small = instance(postgres, "small", room=2)
     for _ in range(3):
-        small._step()
+        small.step()
         assert len(held(registry)) == len(of_small) == 2
     small.close()
 
@@ -208,18 +178,18 @@ def test_a_mission_in_which_nothing_happens_rests_until_its_next_packet(registry
     def after(minutes):
         postgres.rows(f"UPDATE missions SET touched = touched - interval '{minutes} minutes' RETURNING 1")
 
-    one._step()
+    one.step()
     after(29)
     store.put([packet()], 0.0)
     after(29)
-    one._step()
+    one.step()
     assert held(registry) == {"quiet": "one"}
     after(2)
-    one._step()
+    one.step()
     until(lambda: held(registry) == {})
     assert workers[0].is_stopped
     store.put([packet(sequence=1)], 0.0)
-    one._step()
+    one.step()
     assert held(registry) == {"quiet": "one"}
     assert workers[1].lease.fence == 2
     one.close()
@@ -263,7 +233,7 @@ def test_other_instances_announce_a_detector_and_have_its_file(registry, postgre
     assert file.channel not in other.announced()
     nothing = lambda *_: None  # noqa: E731
     following = Instance(registry, "one", 0, nothing, nothing, other.follow)
-    following._step()
+    following.step()
     following.close()
     assert other.announced() == {file.channel: file}
     assert other.path(file.channel, file.version).read_bytes() == BUNDLED_NETWORK.read_bytes()

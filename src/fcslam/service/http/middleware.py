@@ -36,8 +36,8 @@ class UnauthenticatedLimit:
     themselves. Turns go round the addresses, so that one address cannot take those of the others.
     """
 
-    def __init__(self, app: ASGIApp, is_known: Callable[[Scope], bool]) -> None:
-        self._app, self._is_known = app, is_known
+    def __init__(self, app: ASGIApp, is_known: Callable[[Scope], bool], most_waiting: int = MOST_WAITING) -> None:
+        self._app, self._is_known, self._most_waiting = app, is_known, most_waiting
         self._waiting: dict[str, deque[asyncio.Future[bool]]] = {}
         """By address, that of the next turn first."""
         self._count = 0
@@ -46,10 +46,10 @@ class UnauthenticatedLimit:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on when it is its turn, or refuse it."""
         if scope["type"] == "http" and not self._is_known(scope) and (self._waiting or self._passed.wait_s("", 1.0)):
-            if self._count >= MOST_WAITING:
+            if self._count >= self._most_waiting:
                 self._drop()
             if not await self._turn(scope):
-                text = f"{MOST_WAITING} requests without a known token wait already; send a token"
+                text = f"{self._most_waiting} requests without a known token wait already; send a token"
                 await problem(429, text, {"retry-after": "60", "connection": "close"})(scope, receive, send)
                 return
         await self._app(scope, receive, send)

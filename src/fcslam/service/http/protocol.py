@@ -58,9 +58,11 @@ class GuardedServer(uvicorn.Server):
     ``on_exit`` is called when it is asked to stop, before it waits for the answers in progress.
     """
 
-    def __init__(self, config: uvicorn.Config, on_exit: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, config: uvicorn.Config, on_exit: Callable[[], None] = lambda: None, handshake_s: float = IDLE_S
+    ) -> None:
         super().__init__(config)
-        self._on_exit = on_exit
+        self._on_exit, self._handshake_s = on_exit, handshake_s
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """A signal asks to stop."""
@@ -77,7 +79,7 @@ class GuardedServer(uvicorn.Server):
 
         async def listen(factory: _Factory, *, sock: socket.socket, ssl: ssl.SSLContext | None, backlog: int) -> object:
             sock.listen(backlog)
-            return _Listener(factory, sock, ssl)
+            return _Listener(factory, sock, ssl, self._handshake_s)
 
         loop.create_server = listen  # type: ignore[method-assign, assignment]
         return loop
@@ -86,8 +88,11 @@ class GuardedServer(uvicorn.Server):
 class _Listener:
     """Accepts connections one by one: asyncio accepts all that wait at once, and requests in progress wait."""
 
-    def __init__(self, factory: _Factory, listening: socket.socket, tls: ssl.SSLContext | None) -> None:
+    def __init__(
+        self, factory: _Factory, listening: socket.socket, tls: ssl.SSLContext | None, handshake_s: float
+    ) -> None:
         self._factory, self._listening, self._tls = factory, listening, tls
+        self._timeout_s = None if tls is None else handshake_s
         self._handshakes: dict[asyncio.Task[None], None] = {}
         listening.setblocking(False)
         self._accepting = asyncio.get_running_loop().create_task(self._accept())
@@ -115,10 +120,9 @@ class _Listener:
                 next(iter(self._handshakes)).cancel()
 
     async def _connect(self, connection: socket.socket) -> None:
-        timeout_s = None if self._tls is None else IDLE_S
         with suppress(OSError):  # the client is gone, or no client of ours
             await asyncio.get_running_loop().connect_accepted_socket(
-                self._factory, connection, ssl=self._tls, ssl_handshake_timeout=timeout_s
+                self._factory, connection, ssl=self._tls, ssl_handshake_timeout=self._timeout_s
             )
 
 

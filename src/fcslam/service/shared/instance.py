@@ -10,15 +10,13 @@ from typing import Final
 
 from fcslam.errors import InputError, StoreError
 from fcslam.service.shared.mission_tables import Lease
-from fcslam.service.shared.registry import LEASE_S, KnownMission, Registry
+from fcslam.service.shared.registry import KnownMission, Registry
 from fcslam.service.supervisor import RunningWorker
 
 LOOK_S: Final = 0.5
 """Between two renewals of the leases."""
 GRACE_S: Final = 1.5
 """After the store was gone, the others get so long to renew leases that ended meanwhile."""
-NAME_S: Final = LEASE_S + 2.0
-"""How long a new instance waits for its name: one that was killed loses it in this time."""
 
 _log = logging.getLogger(__name__)
 
@@ -93,7 +91,7 @@ class Instance:
                 self._listen("finalized", mission.finalized, name)
 
     def _take_name(self) -> None:
-        for _ in range(round(NAME_S / LOOK_S)):
+        for _ in range(round(2.0 * self._registry.lease_s / LOOK_S)):  # one that was killed loses it in this time
             if self._registry.register(self._most):
                 return
             self._closing.wait(LOOK_S)
@@ -103,7 +101,7 @@ class Instance:
         is_gone = False
         while not self._closing.wait(LOOK_S):
             try:
-                self._step()
+                self.step()
                 is_gone = False
             except StoreError as error:
                 if not is_gone:
@@ -113,7 +111,8 @@ class Instance:
             except Exception:
                 _log.exception("the instance failed at a look, and goes on")
 
-    def _step(self) -> None:
+    def step(self) -> None:
+        """Renew the name and the leases, and take or give up missions."""
         if not self._registry.register(self._most):
             _log.error("another instance took the name '%s'; this one stops", self._name)
             os.kill(os.getpid(), signal.SIGTERM)

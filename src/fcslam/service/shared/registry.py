@@ -16,7 +16,6 @@ _READ: Final = """
 SELECT number, name, is_open, is_wanted, holder, expires > clock_timestamp(), is_ready, live, finalized
 FROM missions ORDER BY name
 """
-_EXPIRY: Final = f"clock_timestamp() + interval '{LEASE_S} seconds'"
 
 
 class KnownMission(NamedTuple):
@@ -47,15 +46,16 @@ class Registry:
         StoreError: from every method: the server cannot be used now.
     """
 
-    def __init__(self, server: Postgres, instance: str, process: str) -> None:
+    def __init__(self, server: Postgres, instance: str, process: str, lease_s: float = LEASE_S) -> None:
         """``process``: a random name of this process, to tell it from another one with the same ``instance``."""
-        self._server, self._instance, self._process = server, instance, process
+        self._server, self._instance, self._process, self.lease_s = server, instance, process, lease_s
+        self._expiry = f"clock_timestamp() + interval '{lease_s} seconds'"
 
     def register(self, room: int) -> bool:
         """Take this instance's name, or renew it, and say how many missions it takes; False: another process has it."""
         taken = self._server.rows(
-            f"INSERT INTO instances VALUES (?, ?, ?, {_EXPIRY}) ON CONFLICT (name) DO UPDATE"
-            f" SET process = excluded.process, room = excluded.room, expires = {_EXPIRY}"
+            f"INSERT INTO instances VALUES (?, ?, ?, {self._expiry}) ON CONFLICT (name) DO UPDATE"
+            f" SET process = excluded.process, room = excluded.room, expires = {self._expiry}"
             " WHERE instances.process = excluded.process OR instances.expires < clock_timestamp() RETURNING 1",
             (self._instance, self._process, room),
         )
@@ -103,7 +103,7 @@ class Registry:
         """Take up to ``most`` missions that need a worker and have none, each with a new fencing number."""
         claimed = self._server.rows(
             "UPDATE missions SET holder = ?, fence = fence + 1, is_ready = false, touched = clock_timestamp(),"
-            f" expires = {_EXPIRY} WHERE number IN (SELECT number FROM missions"
+            f" expires = {self._expiry} WHERE number IN (SELECT number FROM missions"
             " WHERE is_wanted AND expires < clock_timestamp() ORDER BY number LIMIT ? FOR UPDATE SKIP LOCKED)"
             " RETURNING number, fence",
             (self._instance, most),
@@ -116,7 +116,7 @@ class Registry:
             return set()
         missions, fences, ready = zip(*((*lease, is_ready) for lease, is_ready in leases), strict=True)
         renewed = self._server.rows(
-            f"UPDATE missions SET expires = {_EXPIRY}, is_ready = mine.is_ready"
+            f"UPDATE missions SET expires = {self._expiry}, is_ready = mine.is_ready"
             " FROM unnest(CAST(? AS BIGINT[]), CAST(? AS BIGINT[]), CAST(? AS BOOLEAN[]))"
             " AS mine (number, fence, is_ready)"
             " WHERE missions.number = mine.number AND missions.fence = mine.fence"
