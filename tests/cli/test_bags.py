@@ -99,7 +99,7 @@ def test_choices_and_faults_are_said(tmp_path, capsys):
 def test_names_tell_equal_files_apart(tmp_path, bag, capsys):
     twin = save(tmp_path / "run1.mcap", drive(15))
     assert "NAME=LOG" in refused(capsys, "map", bag, twin, "-o", tmp_path / "out")
-    assert "already; give each" in refused(capsys, "map", bag, f"ben={bag}", "-o", tmp_path / "out")
+    assert "so they are copies" in refused(capsys, "map", bag, f"ben={bag}", "-o", tmp_path / "out")
     assert run("map", f"anna={bag}", f"ben={twin}", "-o", tmp_path / "out") == 0
     assert robots(tmp_path / "out") == {"anna": 40, "ben": 15}
 

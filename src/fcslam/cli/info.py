@@ -126,8 +126,6 @@ def _lines(found: "Inspection") -> "Iterator[str]":
         longest = sorted(found.gaps, key=lambda gap: -gap.length_s)[:3]
         shown = ", ".join(f"{gap.length_s:.1f} s after {gap.after_s:.1f} s" for gap in longest)
         yield f"gaps without scans: {len(found.gaps)}; the longest: {shown}"
-    if found.steps_back:
-        yield f"stamps that step back: {found.steps_back}, by up to {found.largest_step_back_s:.3f} s"
     if found.faults:
         yield f"faults: {found.faults}"
     yield from found.notes

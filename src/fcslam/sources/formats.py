@@ -45,24 +45,10 @@ def open_fleet(
     A bag of several robots gives each of them. Sources that are open already stay as they are.
     """
     sources: list[Source] = []
-    given: list[tuple[Path, str, Source]] = []
     for path, name in recordings:
-        if not isinstance(path, Path):
-            sources.append(path)
-            continue
-        source = open_source(path, options, name)
-        for each in source.robots(name) if isinstance(source, RosBag) else [source]:
-            file, which = robot_in(path)[0], each.robot.name if isinstance(each, RosBag) else ""
-            for other_file, other_which, other in given:
-                if which == other_which and _files(file) == _files(other_file):
-                    raise SourceError(f"{path}: is the recording of '{other.name}' already; give each recording once")
-            given.append((file, which, each))
-            sources.append(each)
+        source = open_source(path, options, name) if isinstance(path, Path) else path
+        sources += source.robots(name) if isinstance(source, RosBag) and isinstance(path, Path) else [source]
     return sources
-
-
-def _files(recording: Path) -> list[Path]:
-    return [part.resolve() for part in parts_of(recording)]
 
 
 def check_copies(sources: Sequence[Source]) -> None:

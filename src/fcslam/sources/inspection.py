@@ -82,9 +82,6 @@ class Inspection:
     camera: CameraModel | None = None
     images: int = 0
     gaps: tuple[Gap, ...] = ()
-    steps_back: int = 0
-    """Stamps of scans that are before the stamp of the scan before."""
-    largest_step_back_s: float = 0.0
     faults: str = ""
     """Faults that are tolerated, one line; empty without faults."""
     notes: tuple[str, ...] = ()
@@ -134,8 +131,6 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
             case CameraImage():
                 images += 1
     origin = source.plan.odometry if isinstance(source, RosBag) else None
-    steps_s = np.diff(np.array(stamps))
-    back_s = -steps_s[steps_s < 0.0]
     return Inspection(
         path,
         name,
@@ -150,8 +145,6 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
         survey.camera,
         images,
         _gaps(stamps),
-        len(back_s),
-        float(back_s.max(initial=0.0)),
         str(source.faults) if source.faults else "",
         survey.notes,
     )

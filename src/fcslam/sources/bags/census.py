@@ -4,6 +4,7 @@ Laser scans, odometry and transforms are decoded in this pass and kept in a temp
 too large for that; they are decoded whenever they are read.
 """
 
+import json
 import os
 from array import array
 from collections import Counter
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
-from fcslam.records import Transform
+from fcslam.records import Beams, Sweep, Transform
 from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -34,9 +35,17 @@ from fcslam.sources.bags.codec import (
     MessageCodec,
 )
 from fcslam.sources.bags.container import ZSTD, BagPart, Topic, check_order, open_parts
-from fcslam.sources.bags.messages import header_of, odometry_of, scan_of, transforms_of
+from fcslam.sources.bags.messages import (
+    BeamsError,
+    OdometryReading,
+    ScanMessage,
+    StampedTransform,
+    header_of,
+    odometry_of,
+    scan_of,
+    transforms_of,
+)
 from fcslam.sources.bags.records import MessagePlace, StoredMessage
-from fcslam.sources.bags.tape import Content, packed_content, unpacked_content
 from fcslam.sources.bags.transforms import Link, TransformTree, differ
 from fcslam.untrusted import unpack
 
@@ -50,14 +59,8 @@ _COUNTED: Final = (*SCANS, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
 _READ: Final = (*_COUNTED, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, FIX)
 
 
-@dataclass(slots=True)
-class Broken:
-    """The messages of a topic that are invalid."""
-
-    first: int
-    """Number of the first one in its topic, from 1."""
-    error: str
-    count: int = 0
+Content = ScanMessage | OdometryReading | list[StampedTransform] | ValueError
+"""A decoded message, or why it is invalid."""
 
 
 @dataclass(slots=True)
@@ -71,7 +74,11 @@ class TopicCensus:
     """Frames of scans, or child frames of odometry, with their numbers of messages."""
     links: dict[Link, list[Transform]] = field(default_factory=dict)
     """Transforms of tf from a parent to a child: the first, and the first that differs from it."""
-    broken: Broken | None = None
+    broken: int = 0
+    """Messages that are invalid."""
+    first_broken: int = 0
+    """Number of the first of them, from 1."""
+    error: str = ""
 
     def add(self, time_ns: int) -> None:
         """Count a message."""
@@ -174,7 +181,7 @@ class DecodedBag:
                     decoded: Any
                     if topic.type in _KEPT:
                         _, offset, size = place
-                        decoded = unpacked_content(os.pread(tape, size, offset))
+                        decoded = _unpacked(os.pread(tape, size, offset))
                     else:
                         with parts[at].translated():
                             if at not in payloads:
@@ -207,7 +214,7 @@ class DecodedBag:
                     if message.kind in _COUNTED:
                         content = _counted(topic, message, part.file.ros1)
                         if content is not None and message.kind in _KEPT:
-                            size = tape.write(packed_content(content))
+                            size = tape.write(_packed(content))
                             place, written = MessagePlace(-1, written, size), written + size
                     rows.extend((time_ns, topic.number, at, *place))
                 for named in part.file.topics.values():
@@ -246,8 +253,9 @@ def _counted(topic: TopicCensus, message: StoredMessage, ros1: bool) -> Content 
     try:
         return topic.converted(message, _decode(message.payload, message.kind, ros1))
     except ValueError as error:
-        topic.broken = topic.broken or Broken(topic.count, str(error))
-        topic.broken.count += 1
+        if not topic.broken:
+            topic.first_broken, topic.error = topic.count, str(error)
+        topic.broken += 1
         return error
 
 
@@ -255,3 +263,33 @@ def _decode(payload: bytes, kind: str, ros1: bool) -> Any:
     if not ros1 and payload.startswith(ZSTD):
         payload = unpack(payload, "zstd")
     return MessageCodec(ros1).decode(payload, kind)
+
+
+def _packed(content: Content) -> bytes:
+    if isinstance(content, ScanMessage):
+        fields = json.dumps(("scan", *content._replace(raw_ranges_m=None)))  # type: ignore[arg-type]
+        return fields.encode() + b"\n" + content.raw_ranges_m.tobytes()
+    if isinstance(content, ValueError):
+        return json.dumps((type(content).__name__, str(content))).encode()
+    kind = "odometry" if isinstance(content, OdometryReading) else "transforms"
+    return json.dumps((kind, *content)).encode()
+
+
+def _unpacked(packed: bytes) -> Content:
+    text, _, ranges = packed.partition(b"\n")
+    kind, *fields = json.loads(text)
+    if kind == "scan":
+        stamp, frame, beams, low_m, high_m, _, laser, sweep, _ = fields
+        raw_ranges_m = np.frombuffer(ranges, np.float32)
+        return ScanMessage(
+            stamp, frame, Beams(*beams), low_m, high_m, raw_ranges_m, laser, sweep and Sweep(sweep[0], sweep[1])
+        )
+    if kind == "odometry":
+        stamp, pose, *frames = fields
+        return OdometryReading(stamp, tuple(pose), *frames)
+    if kind == "transforms":
+        return [
+            StampedTransform(stamp, parent, child, Transform(tuple(at), tuple(turn)))
+            for stamp, parent, child, (at, turn) in fields
+        ]
+    return (BeamsError if kind == BeamsError.__name__ else ValueError)(*fields)

@@ -19,13 +19,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
-from fcslam.records import Beams
 from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage
-from fcslam.sources.faults import Audit, Fault
-from fcslam.sources.gate import ScanGate
+from fcslam.sources.faults import Fault
 from fcslam.sources.motion import OdometryUpdates, moving_sweep
-from fcslam.sources.pose import UNKNOWN_POSE, Pose, interpolated_pose
+from fcslam.sources.pose import Pose, interpolated_pose
 
 MAX_GAP_S = 1.0
 """Largest time between a scan and a reading outside of which it has no odometry."""
@@ -132,33 +130,6 @@ class OdometryPairing:
         """Yield all that wait, as no odometry comes any more."""
         while self._queue:
             yield _with_pose(self._queue.popleft(), self._readings)
-
-
-def without_odometry(items: Iterable[tuple[int, Message]]) -> Iterator[tuple[int, Entry]]:
-    """Yield the scans and images in their order, without poses."""
-    for number, item in items:
-        if isinstance(item, ScanMessage):
-            yield number, PosedScan(item, UNKNOWN_POSE, None)
-        elif isinstance(item, ImageMessage):
-            yield number, PosedImage(item, None)
-
-
-class EntryGate:
-    """Leaves out what is not consistent, and counts the faults of the rest."""
-
-    def __init__(self, beams: Iterable[Beams], audit: Audit) -> None:
-        """``beams``: usual ones of each laser."""
-        self._gates, self._audit = [ScanGate(each, audit) for each in beams], audit
-
-    def admits(self, number: int, entry: Entry) -> bool:
-        """Whether the entry of message ``number`` is consistent; a scan without odometry is not."""
-        if not isinstance(entry, PosedScan):
-            return True
-        if not self._gates[entry.scan.laser].admits(number, entry.scan.stamp, entry.scan.beams):
-            return False
-        if entry.fault is not None:
-            self._audit.add(entry.fault, number)
-        return entry.fault is not Fault.NO_ODOMETRY
 
 
 def _with_pose(waiting: _QueuedItem, readings: deque[OdometryReading]) -> tuple[int, Entry]:

@@ -5,15 +5,21 @@ the odometry at its stamp is known (``pairing``). ``gate`` decides which scans a
 ends; a live robot asks which lasers are silent, and does not wait for them, or for odometry, for ever.
 """
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from fcslam.records import Beams
-from fcslam.sources.bags.merging import ScanMerger
+from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import ScanMessage
-from fcslam.sources.bags.pairing import Entry, EntryGate, Message, OdometryPairing, without_odometry
+from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedImage, PosedScan
 from fcslam.sources.bags.sectors import SectorJoiner
-from fcslam.sources.faults import Audit
+from fcslam.sources.faults import Audit, Fault
+from fcslam.sources.gate import ScanGate
+from fcslam.sources.pose import UNKNOWN_POSE
+
+_LONGEST_QUEUE = 20
+"""Most scans of one laser that wait for scans of the others; beyond, another laser has paused."""
 
 Numbered = tuple[int, Entry]
 """An entry with the number of its message."""
@@ -26,6 +32,49 @@ class ReadLaser(NamedTuple):
     is_in_sectors: bool
 
 
+class ScanMerger:
+    """Puts the scans of several lasers in the order of their stamps, as they come."""
+
+    def __init__(self, laser_count: int) -> None:
+        self._queues: list[deque[tuple[int, ScanMessage]]] = [deque() for _ in range(laser_count)]
+        self._silent: set[int] = set()
+        """Lasers that no scan waits for."""
+
+    def add(self, number: int, item: Message) -> Iterator[tuple[int, Message]]:
+        """Add the next item; yields those that wait no longer. Only scans wait."""
+        if len(self._queues) == 1 or not isinstance(item, ScanMessage):
+            yield number, item
+            return
+        self._silent.discard(item.laser)
+        self._queues[item.laser].append((number, item))
+        while self._is_complete() or len(self._queues[item.laser]) > _LONGEST_QUEUE:
+            yield self._earliest()
+
+    @property
+    def awaited(self) -> set[int]:
+        """Lasers for which two or more scans of another one wait."""
+        if max(map(len, self._queues)) < 2:
+            return set()
+        return {laser for laser, queue in enumerate(self._queues) if not queue} - self._silent
+
+    def give_up(self) -> Iterator[tuple[int, Message]]:
+        """Wait no longer for the awaited lasers, until they send again; yields what waited for them."""
+        self._silent |= self.awaited
+        while self._is_complete():
+            yield self._earliest()
+
+    def flush(self) -> Iterator[tuple[int, Message]]:
+        """Yield all scans that wait."""
+        while any(self._queues):
+            yield self._earliest()
+
+    def _is_complete(self) -> bool:
+        return any(self._queues) and all(queue or laser in self._silent for laser, queue in enumerate(self._queues))
+
+    def _earliest(self) -> tuple[int, ScanMessage]:
+        return min((queue for queue in self._queues if queue), key=lambda queue: queue[0][1].stamp).popleft()
+
+
 class SensorReader:
     """Turns scans, odometry and images into consistent entries with poses."""
 
@@ -34,7 +83,7 @@ class SensorReader:
         self._joiners = {number: SectorJoiner() for number, laser in enumerate(lasers) if laser.is_in_sectors}
         self._merger = ScanMerger(len(lasers))
         self._pairing = OdometryPairing() if has_odometry else None
-        self._gate = EntryGate((laser.beams for laser in lasers), audit)
+        self._gates, self._audit = [ScanGate(laser.beams, audit) for laser in lasers], audit
         self._number = 0
 
     def add(self, number: int, item: Message) -> Iterator[Numbered]:
@@ -74,11 +123,22 @@ class SensorReader:
             yield from self._admitted(self._pairing.flush())
 
     def _posed(self, items: Iterable[tuple[int, Message]]) -> Iterator[Numbered]:
-        if self._pairing is None:
-            yield from self._admitted(without_odometry(items))
-            return
         for number, item in items:
-            yield from self._admitted(self._pairing.add(number, item))
+            if self._pairing is not None:
+                yield from self._admitted(self._pairing.add(number, item))
+            elif isinstance(item, ScanMessage):
+                yield from self._admitted([(number, PosedScan(item, UNKNOWN_POSE, None))])
+            elif isinstance(item, ImageMessage):
+                yield number, PosedImage(item, None)
 
     def _admitted(self, entries: Iterable[Numbered]) -> Iterator[Numbered]:
-        return (entry for entry in entries if self._gate.admits(*entry))
+        """The consistent entries; counts the faults of the rest. A scan without odometry is not consistent."""
+        for number, entry in entries:
+            if isinstance(entry, PosedScan):
+                if not self._gates[entry.scan.laser].admits(number, entry.scan.stamp, entry.scan.beams):
+                    continue
+                if entry.fault is not None:
+                    self._audit.add(entry.fault, number)
+                if entry.fault is Fault.NO_ODOMETRY:
+                    continue
+            yield number, entry

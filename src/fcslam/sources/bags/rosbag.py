@@ -184,10 +184,10 @@ class RosBag:
     def _count_broken_transforms(self, audit: Audit, errors: dict[str, str]) -> None:
         read = () if self.plan.odometry is None else self.plan.odometry.topics
         for topic in self.plan.topics.transforms:
-            broken = self.bag.census[topic].broken
-            if broken is not None and topic not in read:
-                errors.setdefault(topic.name, f"message {broken.first} of it: {broken.error}")
-                audit.add(Fault.BROKEN_MESSAGE, broken.first, broken.count)
+            its = self.bag.census[topic]
+            if its.broken and topic not in read:
+                errors.setdefault(topic.name, f"message {its.first_broken} of it: {its.error}")
+                audit.add(Fault.BROKEN_MESSAGE, its.first_broken, its.broken)
 
     @cached_property
     def _reading(self) -> _Reading:
