@@ -3,7 +3,7 @@
 It localizes every scan at once. Everything else is the work of the back end (``fcslam.robot.backend``), which may run
 beside it: packets then come out later, but in the same order and with the same contents.
 
-While scans are doubtful (``fcslam.robot.deferred_scans``), records are deferred. If they show the same place as before,
+While scans are doubtful (``DeferredScans``), records are deferred. If they show the same place as before,
 they are mapped normally. If they show another place, the robot is lost: its session ends before the doubtful scans, and
 a new one begins with them, as after a restart. So no unmeasured motion enters a map. After a ride in a lift
 (``fcslam.lidar.lifts``), the new session is on a floor without a name: the cloud finds out whether it knows this one.
@@ -25,11 +25,10 @@ from fcslam.lidar.tracker import TrackedScan, TrackingResult
 from fcslam.records import CameraImage, DetectorFile, GnssFix, LaserScan, SensorRecord
 from fcslam.robot.backend import BackendInput, NewDetector, PlaceKeyframes, RobotBackend, SessionConfig, SessionEnd
 from fcslam.robot.backend_runner import Submit, inline
-from fcslam.robot.deferred_scans import DeferredScans, Outcome
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.packet_queue import PacketQueue
 from fcslam.robot.predicted_motion import PredictedMotion
-from fcslam.robot.session import Motion, Session, WaitingFixes
+from fcslam.robot.session import DeferredScans, Motion, Outcome, Session, WaitingFixes
 from fcslam.robot.track import ScanTrack
 from fcslam.robot.wheel_odometry import WheelOdometry
 from fcslam.sources.contradictions import RepeatedScans
@@ -195,7 +194,7 @@ class RobotFrontend:
                 self._describe(self.motion.place_image(record))
 
     def _process_scan(self, scan: LaserScan) -> None:
-        if self._session.awaits_second(scan):
+        if self.motion.awaits_second(scan):
             if not self._deferred:
                 self._await_second(scan)
                 return

@@ -135,7 +135,7 @@ class MotionPrediction:
 class PredictedMotion:
     """Motion of a robot without odometry: the one of the last scans goes on, and scan matching corrects it."""
 
-    model = PREDICTED
+    model, jumps, may_be_frozen = PREDICTED, 0, False
 
     def __init__(self) -> None:
         self._prediction = MotionPrediction()

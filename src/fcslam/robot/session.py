@@ -1,8 +1,14 @@
-"""One session of a robot: everything that is tied together by measured motion."""
+"""One session of a robot: everything that is tied together by measured motion, and the scans that may not be.
+
+A robot defers its records while its scans are doubtful, for one of four reasons: its odometry may be frozen, there was
+a gap without odometry, it leaves a closed cabin, or the map does not explain the scans (``fcslam.lidar.lost``). Once
+there are enough of them, they are compared with the map, and an ``Outcome`` says how to go on.
+"""
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from enum import Enum, auto
 from functools import partial
 
 import numpy as np
@@ -10,7 +16,18 @@ import numpy as np
 from fcslam.geometry import se2
 from fcslam.lidar.first_motion import LONGEST_GAP_S
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend, ScanPose
-from fcslam.lidar.lost import drove_on
+from fcslam.lidar.lifts import LEAVING_M, LEAVING_SCANS, Cabin
+from fcslam.lidar.lost import (
+    DOUBTFUL_TRAVEL_M,
+    GAP_TRAVEL_M,
+    MOST_SCANS,
+    SETTLED_M,
+    LostConfig,
+    can_decide,
+    drove_on,
+    is_doubtful,
+    is_lost,
+)
 from fcslam.lidar.tracker import DOUBTFUL, TrackedScan, TrackingResult
 from fcslam.records import CameraImage, FloatArray, GnssFix, KeyscanFix, KeyscanId, LaserScan, Sweep
 from fcslam.robot.backend import BackendInput, NewImage, NewKeyscan
@@ -69,54 +86,26 @@ class Session:
         duration_s = self.lidar.config.scan_duration_s
         if scan.sweep is None and duration_s > 0.0:
             scan = replace(scan, sweep=Sweep(0.0, duration_s))
-            if before is not None and isinstance(self.motion, WheelOdometry):
+            if before is not None and self.motion.model.is_measured:
                 scan = moving_on(scan, before)
         return self.motion.place(scan)
 
     def track(self, scan: LaserScan) -> tuple[LaserScan, TrackingResult]:
         """Localize a scan; returns it as it was deskewed, too."""
-        if isinstance(self.motion, PredictedMotion):
-            return self.motion.track(scan, self.lidar, partial(self._in_odom, scan.stamp))
-        return scan, self.lidar.localize(scan)
+        return self.motion.track(scan, self.lidar, partial(self._in_odom, scan.stamp))
 
     def observe(self, stamp: float, pose: ScanPose, tracked: TrackedScan) -> None:
         """Continue the motion from where the scan at ``stamp`` was found."""
-        if isinstance(self.motion, PredictedMotion):
-            self.motion.observe(stamp, self.poses.in_odom(pose), tracked)
-
-    def awaits_second(self, scan: LaserScan) -> bool:
-        """Whether only a second scan shows the motion during this one."""
-        return isinstance(self.motion, PredictedMotion) and self.motion.awaits_second(scan)
-
-    def begin_motion(self, deferred: Deferred, second: LaserScan) -> LaserScan:
-        """Give the first deferred scan the motion that the second one shows; returns this one, predicted from it."""
-        return self.motion.begin(deferred, second) if isinstance(self.motion, PredictedMotion) else second
-
-    def is_unseen(self, before: LaserScan, scan: LaserScan) -> bool:
-        """Whether nothing shows the motion between two scans although there is a map."""
-        is_predicted = isinstance(self.motion, PredictedMotion) and self.newest is not None
-        return is_predicted and scan.stamp - before.stamp > LONGEST_GAP_S
+        self.motion.observe(stamp, self.poses.in_odom(pose), tracked)
 
     def follow(self, deferred: Deferred, scan: LaserScan, tracking: TrackingResult) -> LaserScan:
         """The next doubtful scan with its motion since those before it."""
-        if not isinstance(self.motion, PredictedMotion):
-            return scan
         return self.motion.follow(deferred, scan, tracking.tracked, self.lidar, partial(self._in_odom, scan.stamp))
 
-    @property
-    def may_be_frozen(self) -> bool:
-        """Whether the odometry stands still although the newest scans have changed."""
-        return isinstance(self.motion, WheelOdometry) and self.motion.check.may_be_frozen
-
-    def drove_on(self, scans: Sequence[LaserScan]) -> bool:
+    def drove_on(self, scans: list[LaserScan]) -> bool:
         """Whether odometry without a jump and the scans agree that the robot drove to where doubtful scans are."""
-        if isinstance(self.motion, PredictedMotion) or self.motion.jumps != self._jumps:
-            return False
-        return drove_on(self._explained, scans, self.lidar.odometry, self.lidar.trust)
-
-    def relocate(self, deferred: Deferred, gap_s: float) -> bool:
-        """Whether doubtful scans that do not contradict the map show the place before them; see ``PredictedMotion``."""
-        return not isinstance(self.motion, PredictedMotion) or self.motion.relocate(deferred, self.lidar, gap_s)
+        is_measured = self.motion.model.is_measured and self.motion.jumps == self._jumps
+        return is_measured and drove_on(self._explained, scans, self.lidar.odometry, self.lidar.trust)
 
     def map(self, scan: LaserScan, tracking: TrackingResult, fixes: Iterable[GnssFix]) -> list[BackendInput]:
         """Continue from a localized scan; returns the keyscan that it becomes, and the fixes of keyscans.
@@ -138,8 +127,7 @@ class Session:
         self._scans[scan.laser.T_base_laser] = scan
         if tracking.explained >= DOUBTFUL * tracking.known:  # false if it was not matched
             self._explained[scan.laser.T_base_laser] = scan
-        if not isinstance(self.motion, PredictedMotion):
-            self._jumps = self.motion.jumps
+        self._jumps = self.motion.jumps
         return inputs
 
     def view(self, image: CameraImage) -> NewImage | None:
@@ -161,3 +149,103 @@ class Session:
             x, y = se2.transform(nearest.T_keyscan_base, np.array([fix.antenna_xy]))[0].tolist()
             keyscan = KeyscanId(self.lidar.robot, nearest.keyscan)
             yield KeyscanFix(keyscan, fix.latitude_deg, fix.longitude_deg, fix.altitude_m, fix.sigma_m, (x, y))
+
+
+class Outcome(Enum):
+    """What doubtful scans show."""
+
+    SAME_PLACE = auto()
+    SAME_PLACE_OTHER_MAP = auto()
+    """The robot drove on, and its newest keyscans are wrong: another local map begins, tied to the past by odometry."""
+    OTHER_PLACE = auto()
+    """The robot is lost."""
+    OTHER_FLOOR = auto()
+    """The robot took a lift."""
+
+
+class DeferredScans:
+    """The records since the first doubtful scan."""
+
+    def __init__(self, config: LostConfig) -> None:
+        self._config = config
+        self._records: Deferred = []
+        self._gap_s = 0.0
+        """Time before the first of them in which nothing shows the motion; 0: there was no gap."""
+        self._cabin = Cabin()
+
+    def __len__(self) -> int:
+        """Number of deferred records."""
+        return len(self._records)
+
+    def follows_gap(self, before: LaserScan, scan: LaserScan, session: Session) -> bool:
+        """Whether nothing shows the motion between two scans, and there is a map in which to look for the later one."""
+        is_unseen = not session.motion.model.is_measured and scan.stamp - before.stamp > LONGEST_GAP_S
+        return is_unseen and self._config.doubted > 0.0 and session.newest is not None
+
+    def begin_gap(self, gap_s: float) -> None:
+        """Defer the scans from the next one on, as nothing shows the motion in the ``gap_s`` seconds before it."""
+        self._gap_s = gap_s
+
+    def watch_cabin(self, scan: LaserScan, session: Session) -> None:
+        """Follow the next scan in and out of a cabin, once something is known from before its door closed."""
+        if session.lidar.settled_m < SETTLED_M:
+            self._cabin.leave()
+        else:
+            self._cabin.add(scan)
+
+    def leave_cabin(self) -> None:
+        """Nothing is known any more from before the door of a cabin closed."""
+        self._cabin.leave()
+
+    def is_doubtful(self, tracking: TrackingResult, session: Session) -> bool:
+        """Whether a localized scan may show another place than those before it."""
+        if session.motion.may_be_frozen or self._gap_s:
+            return True
+        return is_doubtful(tracking, session.lidar, self._config, self._cabin.is_leaving)
+
+    def add(self, record: LaserScan | CameraImage) -> None:
+        """Defer a record as it is."""
+        self._records.append(record)
+
+    def add_doubtful(self, scan: LaserScan, tracking: TrackingResult, session: Session) -> None:
+        """Defer a doubtful scan, with its motion since those before it."""
+        self.add(session.follow(self._records, scan, tracking))
+
+    def can_decide(self, session: Session) -> bool:
+        """Whether there are enough scans to compare them with the map."""
+        travel_m, most = GAP_TRAVEL_M if self._gap_s else DOUBTFUL_TRAVEL_M, MOST_SCANS
+        if self._cabin.is_leaving:
+            travel_m, most = LEAVING_M, LEAVING_SCANS
+        return not session.motion.may_be_frozen and can_decide(self._scans, travel_m, most)
+
+    @property
+    def must_decide(self) -> bool:
+        """Whether the scans are compared even if no more follow: only after a gap, if there are two."""
+        return self._gap_s > 0.0 and len(self._scans) > 1
+
+    def decide(self, session: Session) -> Outcome:
+        """Compare the scans with the newest keyscans of the session; scans that are found elsewhere are moved there."""
+        outcome = self._outcome(self._scans, session)
+        self._cabin.leave()
+        return outcome
+
+    def begin_motion(self, second: LaserScan, session: Session) -> LaserScan:
+        """Give the first scan the motion that the second one shows; returns the second one, predicted from it."""
+        return session.motion.begin(self._records, second)
+
+    def take(self) -> Deferred:
+        """End the deferral; returns the records."""
+        records, self._records, self._gap_s = self._records, [], 0.0
+        return records
+
+    @property
+    def _scans(self) -> list[LaserScan]:
+        return [record for record in self._records if isinstance(record, LaserScan)]
+
+    def _outcome(self, scans: list[LaserScan], session: Session) -> Outcome:
+        lidar, gap_s = session.lidar, self._gap_s
+        if self._cabin.is_leaving and not gap_s:
+            return Outcome.OTHER_FLOOR if is_lost(scans, lidar, self._cabin.closed_s) else Outcome.SAME_PLACE
+        if not gap_s and is_lost(scans, lidar):
+            return Outcome.SAME_PLACE_OTHER_MAP if session.drove_on(scans) else Outcome.OTHER_PLACE
+        return Outcome.SAME_PLACE if session.motion.relocate(self._records, lidar, gap_s) else Outcome.OTHER_PLACE
