@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.robot.image_buffer import MOST_BYTES, MOST_IMAGES, ImageBuffer, KeyframeImage
+from fcslam.robot.keyframe_folder import MOST_BYTES, MOST_IMAGES, ImageBuffer, KeyframeImage
 
 HUNDRED_IMAGES = MOST_BYTES // 100
 

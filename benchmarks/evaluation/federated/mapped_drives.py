@@ -20,7 +20,7 @@ from fcslam.records import FloatArray
 from fcslam.robot.backend import BackendInput, RobotBackend, SessionEnd
 from fcslam.robot.backend_runner import inline
 from fcslam.robot.frontend import RobotFrontend
-from fcslam.robot.image_buffer import KeyframeImage
+from fcslam.robot.keyframe_folder import KeyframeImage
 from fcslam.runs import Run
 from fcslam.sources import Source
 from fcslam.wire.messages import Body

@@ -32,8 +32,7 @@ from fcslam.records import (
     Tag,
     TagSighting,
 )
-from fcslam.robot.image_buffer import KeyframeImage
-from fcslam.robot.keyframe_folder import KeyframeFolder
+from fcslam.robot.keyframe_folder import KeyframeFolder, KeyframeImage
 from fcslam.robot.own_places import OwnPlaces
 from fcslam.robot.tag_detection import TagDetector, TagsConfig
 from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig

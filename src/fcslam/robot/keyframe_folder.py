@@ -1,10 +1,11 @@
-"""Keyframes on the robot's own disk, for the process that learns from them beside the robot. They never leave it.
+"""Keyframes of the camera, in memory and on the robot's own disk. They never leave the robot.
 
-One file for each keyframe, written when it is described, and one for each session with the poses of its keyscans.
+The buffer in memory is for a new detector, which describes the images again; the disk is for the process that learns
+beside the robot: one file for each keyframe, and one for each session with the poses of its keyscans.
 """
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -16,14 +17,51 @@ from fcslam.features.detector import ImageFeatures
 from fcslam.features.lidar_depth import LidarView
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, FloatArray, Transform, frozen
-from fcslam.robot.image_buffer import KeyframeImage
 from fcslam.storage.state_file import State, read_state, write_state
 
 KEYFRAMES: Final = "keyframes"
 """Folder of the keyframes, below a robot's state folder."""
 FITS: Final = "fcslam keyframes 1"
 _POSES, _SUFFIX = "poses", ".state"
+MOST_IMAGES, MOST_BYTES = 500, 32_000_000
+"""Size of the buffer, which is in memory: images, and bytes of all encoded images together."""
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeImage:
+    """An encoded image with all that is needed to find the positions of its keypoints."""
+
+    keyscan: int
+    encoded: bytes
+    camera: CameraModel
+    surroundings: tuple[LidarView, ...]
+    """LiDAR returns of each laser in the base at the time of the image."""
+    T_keyscan_image: FloatArray
+    """Pose of the base at the time of the image in the keyscan's base, shape (3,), metres and radians."""
+
+
+class ImageBuffer:
+    """The newest images, one a keyscan."""
+
+    def __init__(self) -> None:
+        self._images: dict[int, KeyframeImage] = {}
+        self._bytes = 0
+
+    def __iter__(self) -> Iterator[KeyframeImage]:
+        return iter(self._images.values())
+
+    def add(self, image: KeyframeImage) -> list[int]:
+        """Add the image of a keyscan that has none; drop the oldest images if the buffer is full, and return the
+        keyscans of these."""
+        self._images[image.keyscan] = image
+        dropped = []
+        self._bytes += len(image.encoded)
+        while len(self._images) > MOST_IMAGES or self._bytes > MOST_BYTES:
+            oldest = self._images.pop(next(iter(self._images)))
+            self._bytes -= len(oldest.encoded)
+            dropped.append(oldest.keyscan)
+        return dropped
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,8 +19,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.scan import point_scan
 from fcslam.records import CameraImage, Codes, DetectorFile, FloatArray, LaserScan, frozen
-from fcslam.robot.image_buffer import ImageBuffer, KeyframeImage
-from fcslam.robot.keyframe_folder import KeyframeFolder
+from fcslam.robot.keyframe_folder import ImageBuffer, KeyframeFolder, KeyframeImage
 
 SCAN_AGE_S = 1.0
 """Scans of several lasers that are older than the newest by more are not combined with it."""
