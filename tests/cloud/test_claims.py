@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.cloud import claims
-from fcslam.cloud.claims import ClaimLimits, with_least_noise
+from fcslam.cloud.claims import ClaimLimits, check_submap, with_least_noise
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
@@ -65,11 +64,9 @@ def test_a_submap_wider_than_any_is_refused():
     assert "keyscan 120 m away, at most 100 m" in reason
 
 
-def test_a_submap_of_too_many_keyscans_is_refused(monkeypatch):
-    monkeypatch.setattr(claims, "MOST_SUBMAP_KEYSCANS", 9)
-    bodies = [*drive([AHEAD] * 12), place("a", 4, first=0, last=12), place("a", 8, first=4, last=12)]
-    (reason,) = refusals(bodies).values()
-    assert "has 13 keyscans, at most 9" in reason
+def test_a_submap_of_too_many_keyscans_is_refused():
+    with pytest.raises(PacketError, match="has 2001 keyscans, at most 2000"):
+        check_submap(place("a", 4, first=0, last=2000), np.zeros((2001, 3)))
 
 
 def test_a_robot_does_not_leave_the_building():

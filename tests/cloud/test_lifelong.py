@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.cloud import submaps
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
 from fcslam.lab.simulation.recording import true_map
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.lidar.submap import build_submap
 from fcslam.maps.fusion import fuse
 from fcslam.maps.occupancy_map import Occupancy
 from fcslam.metrics.grid import LabelledGrid, grid_agreement
@@ -110,16 +108,6 @@ def test_sessions_stay_joined_when_the_places_that_joined_them_are_forgotten():
 
 def test_submaps_that_are_dropped_and_built_again_change_nothing(forgetful, packets):
     cloud = feed(Cloud(ONE_A_SQUARE.model_copy(update={"submaps_kept": 2}), 0), packets)
-    assert fingerprint(cloud.finalize()) == fingerprint(forgetful.finalize())
-
-
-def test_submaps_that_are_packed_change_nothing_and_are_not_built_again(forgetful, packets, monkeypatch):
-    built = []
-    monkeypatch.setattr(submaps, "UNPACKED", 1)
-    monkeypatch.setattr(submaps, "build_submap", lambda scans: built.append(len(scans)) or build_submap(scans))
-    cloud = feed(Cloud(ONE_A_SQUARE, 0), packets)
-    places = sum(isinstance(packet.body, Place) for packet in packets)
-    assert 1 < len(built) <= places
     assert fingerprint(cloud.finalize()) == fingerprint(forgetful.finalize())
 
 

@@ -2,14 +2,12 @@
 
 import time
 from contextlib import closing
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fcslam.errors import CloudError, UnavailableError
 from fcslam.live.fleet_view import FleetView
-from fcslam.service.joint_maps import JointMaps, JointSession, ServedJointMaps
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.keys import Credentials
 from tests.service.http.desk import SCRIPT, A, B, Desk
@@ -123,26 +121,6 @@ def test_what_the_cloud_says_counts_with_its_tiles(desk, monkeypatch):
             fleet.step()
         assert fleet.robots() == []
         assert fleet.news == []
-
-
-def test_only_robots_of_the_maps_are_remembered(desk):
-    joint = ServedJointMaps()
-    joint.follow(desk.state.mission.joint_maps)
-    joint.say("nobody", 0, (0.0, 0.0, 0.0), 1.0)
-    desk.send("a", A)
-    joint.follow(desk.state.mission.joint_maps)
-    for robot in ("a", "nobody"):
-        joint.say(robot, 0, (0.0, 0.0, 0.0), 1.0)
-    assert set(joint._live) == {"a"}
-
-
-def test_a_robot_is_believed_only_if_it_is_known_when_its_keyscan_came():
-    joint = ServedJointMaps()
-    session = JointSession("a", 0, 0, "", (1.0, 0.0, 0.0), 5.0, 0.0)
-    joint._maps = JointMaps([session], {}, {})
-    joint.say("a", 0, (2.0, 0.0, 0.0), 1e9)
-    assert joint.pose(session) == (session.pose, 0.0)
-    assert joint.pose(replace(session, heard_s=1e9 - 1.0)) == ((2.0, 0.0, 0.0), 1e9)
 
 
 def test_a_robot_that_is_taken_out_leaves_the_map_with_one_event(desk):

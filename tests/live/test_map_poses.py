@@ -8,7 +8,7 @@ import pytest
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
-from fcslam.live.map_poses import CorrectedOdometry
+from fcslam.live.map_poses import CorrectedOdometry, MapPoses
 from fcslam.records import Correction, Keyscan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
@@ -73,3 +73,18 @@ def test_a_correction_replaces_the_last_and_moves_every_pose(driven):
     assert np.allclose(se2.between(CORRECTION.T_map_odom, T_map_odom), 0.0, atol=1e-9)
     corrected.correct(replace(CORRECTION, version=CORRECTION.version + 1, map_index=2))
     assert (corrected.map_index, corrected.age_s) == (2, 0.0)
+
+
+@pytest.mark.parametrize("is_away", [True, False])
+def test_own_closures_move_the_pose_while_the_server_is_away(is_away):
+    """And never the map. While the server is there, its next correction has the closure."""
+    poses, here = MapPoses(lambda: 0.0), np.array([1.0, 2.0, 0.5])
+    own = replace(CORRECTION, version=0, T_map_odom=np.zeros(3))
+    poses.correct(0, own, is_server_away=False)
+    poses.correct_by_server(0, replace(CORRECTION, map_index=1, T_map_odom=np.array([10.0, 0.0, 0.0])))
+    before, T_map_own = poses.localizer(0).T_map_base(here), poses.T_map_own(0)
+    poses.correct(0, replace(own, version=1, T_map_odom=np.array([-2.0, 0.0, 0.0])), is_away)
+    assert np.allclose(poses.localizer(0).T_map_base(here) - before, [-2.0 * is_away, 0.0, 0.0])
+    assert np.array_equal(poses.T_map_own(0), T_map_own)
+    assert poses.localizer(0).map_index == 1
+    assert poses.localizer(1).map_index is None, "another session has its own corrections"

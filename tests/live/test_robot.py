@@ -61,19 +61,6 @@ def test_each_pose_is_that_of_the_tracker(robot, scans):
     assert robot.pose is poses[-1]
 
 
-def test_a_dense_scanner_that_gives_its_maximum_where_nothing_is_maps_as_any_other():
-    """It has 7,200 beams, and sees 5.6 m, which is less in single precision."""
-    dense = fcslam.LaserModel(7200, -math.pi, math.tau / 7200, 5.6)
-    rng = np.random.default_rng(0)
-    truth = worlds.drive([(-2.0, -1.0), (1.5, -1.5), (1.5, 2.0), (-2.0, 1.0), (-2.0, -1.0)], step_m=0.2)
-    odometry = worlds.drifting(truth, rng)
-    measured = worlds.ranges(truth, worlds.room(), dense, 0.01, rng)
-    assert (measured == np.float32(5.6)).any()
-    with fcslam.Robot("anna", dense, wiring=Wiring(SameThread())) as robot:
-        poses = [robot.add_scan(measured[k], 0.1 * k, odometry[k]).T_map_base for k in range(len(truth))]
-    assert worlds.pose_errors(np.array(poses), truth)[0].max() < 0.03
-
-
 def test_the_frame_of_the_odometry_carries_the_correction(robot, scans):
     for pose, scan in zip(drive(robot, scans), scans, strict=True):
         assert np.allclose(se2.compose(pose.T_map_odom, scan.T_odom_base), pose.T_map_base)
@@ -117,20 +104,6 @@ def test_map_and_trajectory_are_there_at_any_time(robot, scans):
     seen = robot.add_scan(scans[-1].ranges_m, scans[-1].stamp, scans[-1].T_odom_base)
     column, row = np.floor((seen.T_map_base[:2] - drawn.origin_xy) / drawn.resolution_m).astype(int)
     assert drawn.cells[row, column] == fcslam.Occupancy.FREE, "where the robot stands"
-
-
-def test_a_robot_that_drives_on_while_its_path_is_asked_for(robot, scans, monkeypatch):
-    drive(robot, scans[:10])
-    poses = robot._own.poses
-
-    def poses_later(session):
-        drive(robot, scans[10:])
-        return poses(session)
-
-    monkeypatch.setattr(robot._own, "poses", poses_later)
-    assert len(robot.trajectory().stamps) == 10
-    monkeypatch.undo()
-    assert len(robot.trajectory().stamps) == len(scans)
 
 
 def test_poses_do_not_wait_for_the_worker(scans):
@@ -248,12 +221,6 @@ def test_odometry_that_says_nothing_is_told_and_not_used(scans, told, words):
     assert np.allclose(se2.compose(pose.T_map_odom, pose.T_odom_base), pose.T_map_base)
 
 
-def test_odometry_that_stops_is_refused(robot, scans):
-    drive(robot, scans[:2])
-    with pytest.raises(InputError, match="some scans have odometry and some have not"):
-        robot.add_scan(scans[2].ranges_m, scans[2].stamp)
-
-
 def test_a_bare_corridor_is_told_once_to_a_robot_without_odometry():
     laser = fcslam.LaserModel(360, -math.pi, math.radians(1.0), 12.0)
     distances = 1.0 / np.maximum(np.abs(np.sin(laser.angles_rad())), 1e-9)
@@ -363,21 +330,18 @@ def test_closures_join_places_that_are_near_each_other(robot, scans):
     assert np.hypot(*(ends[:, 0] - ends[:, 1]).T).max() < 5.0
 
 
-def test_images_are_grey_or_rgb_and_of_the_camera(scans):
-    with fcslam.Robot("anna", scans[0].laser, camera=CAMERA, wiring=Wiring(SameThread())) as robot:
-        drive(robot, scans[:2])
-        robot.add_image(np.zeros((48, 64), np.uint8), scans[1].stamp)
-        robot.add_image(np.zeros((48, 64, 3), np.uint8), scans[1].stamp, scans[1].T_odom_base)
-        for wrong in (np.zeros((48, 63), np.uint8), np.zeros((48, 64)), np.zeros((48, 64, 4), np.uint8), "no image"):
-            with pytest.raises(InputError, match="but the camera gives"):
-                robot.add_image(wrong, scans[1].stamp)
-    with pytest.raises(InputError, match="finished"):
-        robot.add_image(np.zeros((48, 64), np.uint8), scans[1].stamp)
-
-
-def test_an_image_without_a_camera_is_one_line(robot, scans):
+def test_images_are_grey_or_rgb_and_of_the_camera(robot, scans):
     with pytest.raises(InputError, match="the robot has no camera"):
         robot.add_image(np.zeros((48, 64), np.uint8), scans[1].stamp)
+    with fcslam.Robot("anna", scans[0].laser, camera=CAMERA, wiring=Wiring(SameThread())) as seeing:
+        drive(seeing, scans[:2])
+        seeing.add_image(np.zeros((48, 64), np.uint8), scans[1].stamp)
+        seeing.add_image(np.zeros((48, 64, 3), np.uint8), scans[1].stamp, scans[1].T_odom_base)
+        for wrong in (np.zeros((48, 63), np.uint8), np.zeros((48, 64)), np.zeros((48, 64, 4), np.uint8), "no image"):
+            with pytest.raises(InputError, match="but the camera gives"):
+                seeing.add_image(wrong, scans[1].stamp)
+    with pytest.raises(InputError, match="finished"):
+        seeing.add_image(np.zeros((48, 64), np.uint8), scans[1].stamp)
 
 
 @pytest.mark.parametrize(
@@ -421,12 +385,3 @@ def test_a_lift_begins_a_session_on_another_floor(scans, tmp_path):
     assert all(pose.is_localized for pose in poses)
     assert [event.kind for event in events if event.kind == fcslam.EventKind.FLOOR] == ["floor"]
     assert not [event for event in events if event.kind == fcslam.EventKind.LOST]
-
-
-def test_a_robot_that_has_not_moved_changes_its_floor_at_once(scans, tmp_path):
-    with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(SameThread())) as robot:
-        robot.change_floor("2")
-        drive(robot, scans)
-        robot.finish()
-        run = robot.save(tmp_path / "run")
-    assert [trajectory.floor for trajectory in run.trajectories.values()] == ["2"]

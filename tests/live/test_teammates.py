@@ -7,18 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import fcslam
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast, classify
 from fcslam.live.fleet_view import MapTeammates
 from fcslam.live.joint_map import JointMap
-from fcslam.live.records import Wiring
+from fcslam.live.map_poses import CorrectedOdometry
 from fcslam.live.teammates import OLDEST_S, beams_on_teammates
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import Correction, Keyscan, KeyscanId, LaserModel, LaserScan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Hello, Packet
 from tests.lidar import worlds
-from tests.live.same_thread import SameThread
 
 LASER = LaserModel(360, -math.pi, math.radians(1.0), 8.0)
 RADIUS_M = 0.3
@@ -109,6 +107,24 @@ def corridor_map():
     return OccupancyMap(cells, 0.05, (-20.0, -1.5))
 
 
+class Follower:
+    """The front end of a robot whose odometry begins where the joint map does."""
+
+    def __init__(self, fleet, radius_m):
+        self.shown = JointMap(fleet, OccupancyConfig(robot_radius_m=radius_m))
+        self.frontend = RobotFrontend("a", RobotConfig(), mark=self._mark)
+        self._pose = None
+
+    def _mark(self, scan):
+        return self.shown.mark_teammates(scan, 0, self._pose)
+
+    def add(self, ranges, stamp, odometry):
+        scan = LaserScan(stamp, frozen(ranges, np.float32), LASER, frozen(odometry))
+        self.shown.add(self.frontend.process(scan))
+        self._pose = place(frozen(self.frontend.scan_poses.in_odom(self.frontend.newest.pose)))
+        return self._pose.T_map_base
+
+
 def convoy(robot, fleet):
     """Drive 10 m behind another robot through a corridor; returns the true and the estimated way."""
     rng = np.random.default_rng(1)
@@ -120,7 +136,7 @@ def convoy(robot, fleet):
         ahead = pose + np.array((1.0, 0.0, 0.0))
         fleet.hear(mate(*ahead[:2]))
         ranges, _ = with_disc(empty, pose, ahead[:2])
-        poses.append(robot.add_scan(ranges, 0.1 * k, odometry[k]).T_map_base)
+        poses.append(robot.add(ranges, 0.1 * k, odometry[k]))
     return truth, np.array(poses)
 
 
@@ -128,13 +144,9 @@ def test_a_robot_that_follows_another_through_a_corridor_knows_that_it_drives():
     """In its own frame, the robot ahead stands still, and the walls say nothing."""
     ends = {}
     for radius_m in (0.35, 0.0):
-        config = {"map": {"robot_radius_m": radius_m}}
-        with fcslam.Robot("a", LASER, config=config, wiring=Wiring(SameThread())) as robot:
-            robot.fleet = Fleet(corridor_map())
-            robot._joint = JointMap(robot.fleet, robot._config.map)
-            robot._map_poses.correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
-            truth, poses = convoy(robot, robot.fleet)
-            ends[radius_m] = np.hypot(*(poses - truth)[-1, :2])
+        fleet = Fleet(corridor_map())
+        truth, poses = convoy(Follower(fleet, radius_m), fleet)
+        ends[radius_m] = np.hypot(*(poses - truth)[-1, :2])
     assert ends[0.35] < 0.3
     assert ends[0.0] > 3.0, "or the test shows nothing"
 
@@ -146,16 +158,13 @@ def test_a_robot_that_stands_is_no_ghost_in_what_this_robot_saw_last(joint):
     shifted = replace(joint, origin_xy=tuple((np.array(joint.origin_xy) - start).tolist()))
     ghosts = {}
     for radius_m in (0.35, 0.0):
-        config = {"map": {"robot_radius_m": radius_m}}
-        with fcslam.Robot("a", LASER, config=config, wiring=Wiring(SameThread())) as robot:
-            robot.fleet = Fleet(shifted)
-            robot._joint = JointMap(robot.fleet, robot._config.map)
-            robot.fleet.hear(mate(*(standing - start)))
-            robot._map_poses.correct_by_server(0, Correction("a", 1, 0, frozen(np.zeros(3))))
-            for k, pose in enumerate(poses):
-                scan, _ = scan_at(pose, worlds.room(), standing)
-                robot.add_scan(scan.ranges_m, 0.1 * k, pose)
-            drawn = robot.joint_map()
+        fleet, localizer = Fleet(shifted), CorrectedOdometry(lambda: 0.0)
+        fleet.hear(mate(*(standing - start)))
+        localizer.correct(Correction("a", 1, 0, frozen(np.zeros(3))))
+        robot = Follower(fleet, radius_m)
+        for k, pose in enumerate(poses):
+            robot.add(scan_at(pose, worlds.room(), standing)[0].ranges_m, 0.1 * k, pose)
+        drawn = robot.shown.draw(0, robot.frontend.scan_poses, localizer)
         rows, columns = np.nonzero(drawn.cells == Occupancy.OCCUPIED)
         places = drawn.origin_xy + 0.05 * (np.stack((columns, rows), axis=-1) + 0.5)
         ghosts[radius_m] = np.count_nonzero(np.hypot(*(places - (standing - start)).T) < RADIUS_M + 0.05)

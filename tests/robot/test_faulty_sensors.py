@@ -7,6 +7,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.mapped_scans import MappedScans
 from fcslam.sources.contradictions import FROZEN
 from tests import small_fleet
 
@@ -89,7 +90,7 @@ def test_people_who_pass_a_robot_at_rest_end_no_session(robot):
 def test_a_covered_laser_clears_nothing(robot, seen):
     scan = next(iter(robot.scans()))
     covered = replace(scan, ranges_m=np.full_like(scan.ranges_m, seen), stamp=scan.stamp + 0.3)
-    assert not RobotFrontend("r", RobotConfig())._mapped.of(covered).ranges_m.any()
+    assert not MappedScans().of(covered).ranges_m.any()
     part = np.where(np.arange(len(scan.ranges_m)) < 100, seen, scan.ranges_m).astype(np.float32)
-    mapped = RobotFrontend("r", RobotConfig())._mapped.of(replace(scan, ranges_m=part)).ranges_m
+    mapped = MappedScans().of(replace(scan, ranges_m=part)).ranges_m
     assert np.array_equal(mapped[:100], np.full(100, seen, np.float32)), "of a scan with returns, inf is free"

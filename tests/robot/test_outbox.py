@@ -1,7 +1,6 @@
 """The outbox forgets what the cloud has, and nothing else, whatever happens to its process."""
 
 import os
-import shutil
 import signal
 import sqlite3
 import subprocess
@@ -254,13 +253,6 @@ def test_what_is_resumed_must_be_the_same(outbox, path):
     again.close()
 
 
-def test_where_there_is_nothing_to_resume_a_robot_starts(path):
-    outbox = Outbox(path, "alice", LIMIT)
-    assert outbox.begin("r", resume=True) == 0
-    assert outbox.epoch == 0
-    outbox.close()
-
-
 def test_a_folder_has_one_robot_and_one_process(outbox, path):
     with pytest.raises(InputError, match="another process runs on it"):
         Outbox(path, "alice", LIMIT)
@@ -351,31 +343,3 @@ def test_a_cut_outbox_is_told(path):
         with pytest.raises(InputError, match=r"cannot be used: .*; give another --state") as told:
             Outbox(path, "alice", LIMIT)
         assert "\n" not in str(told.value)
-
-
-LOG = "outbox.sqlite-wal"
-FRAME = 4096 + 24
-
-
-@pytest.fixture(scope="module")
-def killed(tmp_path_factory):
-    """The files of a killed process that put 31 packets."""
-    folder, copied = tmp_path_factory.mktemp("killed"), tmp_path_factory.mktemp("copied")
-    outbox = Outbox(folder / "outbox.sqlite", "alice", LIMIT)
-    outbox.begin("r", resume=False)
-    outbox.synchronize({})
-    for k in range(31):
-        outbox.put([said(k, [KEYSCAN, LIDAR_PLACE][k % 2])])
-    for name in ("outbox.sqlite", LOG):
-        shutil.copy(folder / name, copied)
-    outbox.close()
-    return copied
-
-
-def test_a_frame_that_was_being_written_is_no_damage(killed, tmp_path):
-    """A kill between the header and the page of the last frame."""
-    path = Path(shutil.copytree(killed, tmp_path / "state")) / "outbox.sqlite"
-    log = (path.parent / LOG).read_bytes()
-    (path.parent / LOG).write_bytes(log[:-4096] + bytes(4096))
-    with closing(Outbox(path, "alice", LIMIT)) as outbox:
-        assert len(drain(outbox)) == 30

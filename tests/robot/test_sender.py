@@ -194,21 +194,6 @@ def test_a_refused_packet_stays_until_it_is_kept_elsewhere(robot):
     assert content(robot.outbox.packet(0, 1)) == content(encode(said(1)))
 
 
-def test_what_was_refused_in_an_answer_that_was_lost_is_set_aside(robot):
-    packets = [said(k, time=2000.0 + k) for k in range(3)]
-    network = robot.network
-    network.cloud.unwanted = {content(encode(packets[1]))}
-    robot.outbox.put(packets)
-    network.faults = ["none", "answer lost"]
-    robot.step()
-    assert (robot.refused, robot.outbox.waiting.packets) == ([], 3)
-    for _ in range(2):
-        robot.step()
-    assert robot.refused == [(content(encode(packets[1])), "unwanted")]
-    assert (robot.sender.confirmed, robot.sender.refusals) == (2, 1)
-    assert "1; the last is packet 1 of start 0: unwanted" in " ".join(robot.sender.notices)
-
-
 def test_a_robot_says_that_it_is_removed_and_no_longer_when_it_is_back(robot):
     robot.outbox.put([said(k) for k in range(2)])
     for removed in (False, True, False):
@@ -324,8 +309,3 @@ def test_a_detector_is_fetched_once_and_one_that_is_not_there_not_asked_for_agai
     assert robot.kept == [(DETECTOR_UPDATE.file, b"network")]
     assert cloud.fetched == [DETECTOR_UPDATE.file.version, "gone"]
     assert robot.outbox.waiting.packets == 0
-
-
-def test_trouble_is_an_error_of_its_own():
-    assert UnavailableError("x").retry_after_s == 0.0
-    assert not isinstance(UnavailableError("x"), CloudError)
