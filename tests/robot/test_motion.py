@@ -148,12 +148,6 @@ def test_odometry_that_never_changes_is_not_used():
     assert spinning.error_m(frontend.tracks[1]) < 0.005
 
 
-def test_odometry_whose_heading_is_never_set_is_not_used():
-    frontend, _ = mapped(spinning.drive(odometry=lambda stamp: spinning.pose_at(stamp) * (1.0, 1.0, 0.0)))
-    assert not frontend.motion.model.is_measured
-    assert spinning.error_m(frontend.tracks[-1]) < 0.005
-
-
 @pytest.mark.parametrize("begin_s", [1.0, 1.6, 4.0])
 @pytest.mark.parametrize(("rate_hz", "most_m"), [(7.0, 0.005), (5.0, 0.01), (4.0, 0.025)])
 def test_without_odometry_a_robot_that_begins_in_a_turn_is_mapped(begin_s, rate_hz, most_m):

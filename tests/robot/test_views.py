@@ -14,7 +14,6 @@ from fcslam.features.detector import OnnxConfig, OnnxDetector
 from fcslam.features.detector_kinds import DetectorKind
 from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus, Keyscan, LaserScan, Place, frozen
-from fcslam.robot import views
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.views import ViewsConfig
 from fcslam.wire.messages import Hello, Packet
@@ -158,11 +157,6 @@ def test_images_change_nothing_but_camera_places(seen):
         encode(Packet("r", 0, 0, 1e9, a)) == encode(Packet("r", 0, 0, 1e9, b))
         for a, b in zip(sighted, blind, strict=True)
     )
-
-
-def test_images_with_few_keypoints_are_no_places(seen, monkeypatch):
-    monkeypatch.setattr(views, "FEWEST_KEYPOINTS", 2000)
-    assert places(bodies_of(seen[0])[0]) == []
 
 
 def test_without_odometry_at_the_image_the_robot_stands(seen):
