@@ -32,7 +32,6 @@ from fcslam.geometry import se2
 from fcslam.sources import open_source
 from tests.carmen_logs import write_carmen
 from tests.lab.simulation.gl import require_gl
-from tests.live.same_thread import SameThread
 from tests.sources.test_bag_robots import fleet_bag
 from tests.test_docs import PAGES, ROOT, command_lines
 
@@ -246,7 +245,7 @@ def downloads(port: int) -> set[tuple[str, str]]:
 
 
 @pytest.mark.slow
-def test_two_robots_and_a_service_as_the_pages_show_them(logs, desk, capsys, monkeypatch):
+def test_two_robots_and_a_service_as_the_pages_show_them(logs, desk, capsys):
     for name, long in (("anna", LONG), ("ben", MEETS)):  # after 45 scans, the evidence for a join is at its limit
         (link := desk / "examples" / "logs" / f"{name}.clf.xz").unlink()
         link.symlink_to(logs / long)
@@ -261,8 +260,7 @@ def test_two_robots_and_a_service_as_the_pages_show_them(logs, desk, capsys, mon
     try:
         assert answer(f"http://127.0.0.1:{port}/healthz", service)
         first, second = (there(command) for command in BESIDE_A_SERVICE["two robots at a time"])
-        robot = start(first)  # with its back end in another process; the others do without, which takes less time
-        monkeypatch.setattr("fcslam.live.records.worker_process", SameThread)
+        robot = start(first)
         assert run(second) == 0
         said = robot.communicate(timeout=PATIENCE_S)[0]
         assert robot.returncode == 0, said
@@ -286,17 +284,16 @@ def test_two_robots_and_a_service_as_the_pages_show_them(logs, desk, capsys, mon
 
 
 @pytest.mark.slow
-def test_the_pages_of_runs_are_served(desk, monkeypatch):
-    """Up to the server; tests/cli/test_show.py looks at a page and presses Ctrl-C."""
-    served: list[object] = []
-    monkeypatch.setattr("fcslam.page.routes.serve_page", lambda app, _: served.append(app))
-    monkeypatch.setenv("DISPLAY", "")
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+def test_the_pages_of_runs_are_served(desk):
     assert main(["map", "robot1.clf", "-o", "runs/sample", "--quiet"]) == 0
     (desk / "runs" / "building").symlink_to("sample")
     for command in BESIDE_A_SERVICE["pages"]:
-        assert run(command) == 0
-    assert len(served) == len(BESIDE_A_SERVICE["pages"])
+        page = start(command)
+        assert page.stdout is not None
+        url = page.stdout.readline().split()[-1]
+        assert b"<html" in answer(url, page)
+        end(page)
+        assert page.returncode == 0
 
 
 @pytest.mark.slow

@@ -46,7 +46,7 @@ def test_a_cache_folder_that_cannot_be_made_does_no_harm(tmp_path):
 def test_code_of_an_installed_package_is_in_the_cache_folder_of_the_user_so_pip_removes_all_of_the_package(tmp_path):
     package = tmp_path / "site-packages"
     package.mkdir()
-    (package / "module.py").write_text("from fcslam.compiled import njit\n@njit\ndef f(x):\n    return x + 1\n")
+    (package / "module.py").write_text(MODULE)
     script = f"import sys; sys.path.insert(0, {str(package)!r})\nimport module\nprint(module.f(1))"
     home = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "NUMBA_CACHE_DIR": "", "PYTHONDONTWRITEBYTECODE": "1"}
     done = run(script, **home)
@@ -55,10 +55,11 @@ def test_code_of_an_installed_package_is_in_the_cache_folder_of_the_user_so_pip_
     assert any((tmp_path / "cache").rglob("*.nbi"))
 
 
+MODULE = "from fcslam.compiled import is_compiled, njit\n@njit\ndef f(x):\n    return x + 1\n"
+
+
 def test_a_cache_folder_that_fails_later_does_no_harm(tmp_path):
-    (tmp_path / "module.py").write_text(
-        "from fcslam.compiled import is_compiled, njit\n@njit\ndef f(x):\n    return x + 1\n"
-    )
+    (tmp_path / "module.py").write_text(MODULE)
     script = (
         f"import os, shutil, sys; sys.path.insert(0, {str(tmp_path)!r})\n"
         "import module\n"
@@ -71,9 +72,7 @@ def test_a_cache_folder_that_fails_later_does_no_harm(tmp_path):
 
 
 def test_the_cache_holds_what_was_compiled(tmp_path):
-    (tmp_path / "module.py").write_text(
-        "from fcslam.compiled import is_compiled, njit\n@njit\ndef f(x):\n    return x + 1\n"
-    )
+    (tmp_path / "module.py").write_text(MODULE)
     script = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
         "from module import f, is_compiled\n"

@@ -192,15 +192,6 @@ def test_the_table_of_rooms_is_in_the_order_of_imports():
     assert re.findall(r"^\| \w* *\| `([\w/]+)` \|", table, re.MULTILINE) == rooms
 
 
-def test_the_pages_on_algorithms_name_every_equation_and_line():
-    names = ("algorithm", "lidar-slam", "vocabulary", "cloud")
-    text = "".join((ROOT / "docs" / "develop" / f"{name}.md").read_text(encoding="utf-8") for name in names)
-    assert [
-        name for name in ("eq. (1)", "(2), (3)", "eq. (4)", "eq. (5)", "eq. (6)", "Algorithm 1") if name not in text
-    ] == []
-    assert len(SYMBOL.findall(text)) > 40
-
-
 def test_the_documented_example_writes_a_bag_that_can_be_read(tmp_path, monkeypatch):
     from fcslam.sources import open_source
 

@@ -33,26 +33,3 @@ def test_every_key_of_the_configuration_has_a_row_with_its_default():
     assert "| `losses` |" in page
     assert "| `local_steps` |" in page
     assert "`training.steps`" not in page, "it refers to the section on training"
-
-
-@pytest.mark.parametrize(
-    ("key", "unit"),
-    [
-        ("a.drift_rad_m", "rad/m"),
-        ("maximum", "-"),
-        ("packets_per_s", "1/s"),
-    ],
-)
-def test_the_unit_follows_from_the_suffix(key, unit):
-    assert settings_reference.unit(key) == unit
-
-
-@pytest.mark.parametrize(
-    ("effect", "expected"),
-    [
-        ("Largest speed [m/s].", ("Largest speed.", "m/s")),
-        ("Scaled to [0, 1].", ("Scaled to [0, 1].", "")),
-    ],
-)
-def test_a_unit_in_brackets_at_the_end_goes_to_its_column(effect, expected):
-    assert settings_reference.split_unit(effect) == expected
