@@ -10,7 +10,7 @@ from fcslam.ros.network import Quality, RosNetwork
 from fcslam.ros.topics import TF_STATIC
 from fcslam.sources.bags.transforms import last_part
 
-LARGEST_INBOX_BYTES: Final = 256_000_000
+LARGEST_INBOX_BYTES: Final = 64_000_000
 """Most bytes that wait; beyond, the next messages are lost."""
 _DEPTH: Final = 1000
 """Messages that the middleware keeps for this process; of odometry and tf there are many."""

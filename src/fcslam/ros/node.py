@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 
 STRING, EMPTY = "std_msgs/String", "std_msgs/Empty"
 SAVE_MAP, FINISH, FLOOR, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "fcslam/floor", "initialpose"
-MOST_WAITING_BYTES = 64_000_000
-"""Of messages that wait to be read; beyond, newer ones are lost."""
 _NAMES_WAITING = 8
 """Most maps that wait to be saved; anybody on the network may ask for them."""
 _LINES_TOLD = 1000
@@ -100,8 +98,7 @@ class RobotNode:
         self._suggest_pose, self._change_floor = suggest_pose, change_floor
         self._codec = MessageCodec(ros1=False)
         self._inbox = Inbox(
-            MOST_WAITING_BYTES,
-            lambda: self._tell_once("messages come faster than this computer can map; some are lost"),
+            report_loss=lambda: self._tell_once("messages come faster than this computer can map; some are lost")
         )
         self._names: queue.Queue[str] = queue.Queue(_NAMES_WAITING)
         """Of the files of maps to be saved."""
@@ -254,7 +251,7 @@ class RobotNode:
                     if self.sensors.planner.is_without_odometry
                     else self.sensors.planner.odom_frame
                 )
-                self._outputs.transform(transform.stamp_ns, child, transform.T_map_odom)
+                self._outputs.transform(transform[0], child, transform[1])
             due_s = max(due_s + period_s, time.monotonic() - period_s)
 
     def _publish_maps(self) -> None:

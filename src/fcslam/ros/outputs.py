@@ -6,10 +6,9 @@ Frames follow REP 105. The robot publishes ``map -> odom``; the driver of the ba
 import threading
 from collections.abc import Mapping, Sequence
 from math import hypot
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray
@@ -53,15 +52,6 @@ SPHERE_M: Final = 0.3
 _LINE_LIST, _SPHERE_LIST = 5, 7
 
 
-class Grid(NamedTuple):
-    """An occupancy grid as ROS has it."""
-
-    values: NDArray[np.int8]
-    """-1 unknown, 0 free, 100 occupied; shape (H, W), from the lowest y."""
-    resolution_m: float
-    origin_xy: tuple[float, float]
-
-
 class Outputs:
     """The publishers of one robot. Any thread may call."""
 
@@ -72,7 +62,7 @@ class Outputs:
         self._lock = threading.Lock()
         self._publishers: dict[str, Publish] = {}
         """By topic; new ones are made under the lock."""
-        self._maps: dict[str, Grid] = {}
+        self._maps: dict[str, OccupancyMap] = {}
         self._teammates: set[str] = set()
         self._goal_xy: FloatArray = np.full(2, np.nan)
         self._begin(MAP, GRID, LATCHED)
@@ -101,17 +91,9 @@ class Outputs:
 
     def path(self, stamp_ns: int, stamps: FloatArray, T_map_base: FloatArray) -> None:
         """Publish the path: stamps (N,) in seconds and poses (N, 3), thinned to steps of at least ``PATH_STEP_M``."""
-        header, make = self._codec.header, self._codec.make
-        frame = self._map_frame
-        poses = [
-            make(
-                "geometry_msgs/PoseStamped",
-                header=header(nanoseconds(stamps[at]), frame),
-                pose=self._codec.pose(in_space(T_map_base[at])),
-            )
-            for at in _steps(T_map_base)
-        ]
-        self._send("path", PATH, make(PATH, header=header(stamp_ns, frame), poses=poses))
+        poses = [self._posed(nanoseconds(stamps[at]), T_map_base[at]) for at in _steps(T_map_base)]
+        header = self._codec.header(stamp_ns, self._map_frame)
+        self._send("path", PATH, self._codec.make(PATH, header=header, poses=poses))
 
     def closures(self, stamp_ns: int, ends_xy: FloatArray) -> None:
         """Publish the accepted closures as lines between two places (N, 2, 2), metres in ``map``."""
@@ -133,9 +115,7 @@ class Outputs:
             self._send(FLEET_FRONTIERS, MARKERS, self._codec.make(MARKERS, markers=markers))
             if T_map_goal is not None and not np.array_equal(T_map_goal[:2], self._goal_xy):
                 self._goal_xy = T_map_goal[:2]
-                header = self._codec.header(now_ns, self._map_frame)
-                goal = self._codec.make(POSE_STAMPED, header=header, pose=self._codec.pose(in_space(T_map_goal)))
-                self._send(FLEET_GOAL, POSE_STAMPED, goal)
+                self._send(FLEET_GOAL, POSE_STAMPED, self._posed(now_ns, T_map_goal))
 
     def quality(self, now_ns: int, robot: str, maps: "Sequence[QualityReply]") -> None:
         """Publish how good the map of a robot is, by its certificate."""
@@ -162,14 +142,13 @@ class Outputs:
 
     def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP) -> bool:
         """Publish a map if it changed; returns whether it did."""
-        grid = Grid(_GRID_VALUES[occupancy.cells], occupancy.resolution_m, occupancy.origin_xy)
         with self._lock:
             self._begin(topic, GRID, LATCHED)
             before = self._maps.get(topic)
-            if before is not None and before[1:] == grid[1:] and np.array_equal(before.values, grid.values):
+            if before is not None and _is_same(before, occupancy):
                 return False
-            self._maps[topic] = grid
-            self._send(topic, GRID, self._grid_message(stamp_ns, grid))
+            self._maps[topic] = occupancy
+            self._send(topic, GRID, self._grid_message(stamp_ns, occupancy))
             return True
 
     def fleet(
@@ -191,14 +170,14 @@ class Outputs:
             near = [mate for mate in teammates if mate.map_index == own]
             poses = [self._codec.pose(in_space(mate.T_map_base)) for mate in near]
             self._send(FLEET_POSES, POSES, make(POSES, header=self._codec.header(now_ns, frame), poses=poses))
-            for mate, pose in zip(near, poses, strict=True):
+            for mate in near:
                 topic = f"fleet/{_topic_name(mate.robot)}/pose"
                 if topic not in self._teammates and len(self._teammates) >= MOST_TEAMMATES:
                     continue
                 self._teammates.add(topic)
                 self._begin(topic, POSE_STAMPED, STREAMED)
-                header = self._codec.header(max(0, now_ns - nanoseconds(mate.age_s)), frame)
-                self._send(topic, POSE_STAMPED, make(POSE_STAMPED, header=header, pose=pose))
+                stamp_ns = max(0, now_ns - nanoseconds(mate.age_s))
+                self._send(topic, POSE_STAMPED, self._posed(stamp_ns, mate.T_map_base))
             statuses = [
                 self._status(
                     f"robot {mate.robot}",
@@ -282,18 +261,27 @@ class Outputs:
             points=[vector("Point", x, y) for x, y in points.reshape(-1, 2).tolist()],
         )
 
-    def _grid_message(self, stamp_ns: int, grid: Grid) -> Any:
-        height, width = grid.values.shape
+    def _grid_message(self, stamp_ns: int, occupancy: OccupancyMap) -> Any:
+        height, width = occupancy.cells.shape
         info = self._codec.make(
             "nav_msgs/MapMetaData",
             map_load_time=self._codec.time(stamp_ns),
-            resolution=grid.resolution_m,
+            resolution=occupancy.resolution_m,
             width=width,
             height=height,
-            origin=self._codec.pose(in_space(np.array((*grid.origin_xy, 0.0)))),
+            origin=self._codec.pose(in_space(np.array((*occupancy.origin_xy, 0.0)))),
         )
         header = self._codec.header(stamp_ns, self._map_frame)
-        return self._codec.make(GRID, header=header, info=info, data=grid.values.ravel())
+        return self._codec.make(GRID, header=header, info=info, data=_GRID_VALUES[occupancy.cells].ravel())
+
+    def _posed(self, stamp_ns: int, T_map_base: FloatArray) -> Any:
+        header = self._codec.header(stamp_ns, self._map_frame)
+        return self._codec.make(POSE_STAMPED, header=header, pose=self._codec.pose(in_space(T_map_base)))
+
+
+def _is_same(before: OccupancyMap, after: OccupancyMap) -> bool:
+    is_in_place = (before.resolution_m, before.origin_xy) == (after.resolution_m, after.origin_xy)
+    return is_in_place and np.array_equal(before.cells, after.cells)
 
 
 def _topic_name(robot: str) -> str:

@@ -1,16 +1,8 @@
 """The stamps of ``map -> odom``: between two scans the transform is published again, for later times."""
 
 import threading
-from typing import NamedTuple
 
 from fcslam.records import FloatArray
-
-
-class DueTransform(NamedTuple):
-    """A transform to publish."""
-
-    stamp_ns: int
-    T_map_odom: FloatArray
 
 
 class TransformStream:
@@ -44,8 +36,8 @@ class TransformStream:
         with self._lock:
             self._newest = self._last_ns = None
 
-    def due(self, now_ns: int) -> DueTransform | None:
-        """Return the transform to publish at ``now_ns``; None without a scan, or if nothing newer is known."""
+    def due(self, now_ns: int) -> tuple[int, FloatArray] | None:
+        """The stamp and the transform to publish at ``now_ns``; None without a scan, or if nothing newer is known."""
         with self._lock:
             if self._newest is None:
                 return None
@@ -55,4 +47,4 @@ class TransformStream:
             if self._last_ns is not None and stamp_ns <= self._last_ns:
                 return None
             self._last_ns = stamp_ns
-            return DueTransform(stamp_ns, T_map_odom)
+            return stamp_ns, T_map_odom
