@@ -19,6 +19,7 @@ from fcslam.records import Channel, Correction, Edit, Removal, Undo, Veto, froze
 from fcslam.service.shared.mission_tables import MissionTables
 from fcslam.service.shared.registry import Registry
 from fcslam.storage.database import SealedConnection, seal
+from fcslam.storage.row_store import change_rows
 from fcslam.wire.messages import PacketKind
 
 pytestmark = pytest.mark.slow
@@ -276,7 +277,7 @@ def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
             "seal": "UPDATE packets SET time = 1.0 WHERE sequence = 3",
         }
         if harm in changes:
-            connection.update(PACKETS, changes[harm], "sequence = 3", {})
+            change_rows(connection, PACKETS, changes[harm], "sequence = ?", (3,))
         elif harm in rows:
             table, row = rows[harm]
             connection.insert(table, [row])

@@ -22,7 +22,7 @@ from fcslam.config import one_line
 from fcslam.errors import InputError, PacketConflictError, StoreError
 from fcslam.records import Change, Channel, Constraint, Correction, Edit, Keyscan, ManualClosure, Removal, Undo, frozen
 from fcslam.storage.database import Database, check_file, translate_errors
-from fcslam.storage.row_store import RowStore, StoreTable, Transaction
+from fcslam.storage.row_store import RowStore, StoreTable, Transaction, change_rows
 from fcslam.untrusted import check_unpacked, open_database, unpack
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import Hello, PacketKind
@@ -207,10 +207,9 @@ class MissionStore:
 
     def refuse(self, robot: str, epoch: int, sequence: int, reason: str) -> None:
         """Note that a packet does not fit what its robot sent before."""
-        where = "robot = :robot AND epoch = :epoch AND sequence = :sequence"
-        number = {"robot": robot, "epoch": epoch, "sequence": sequence}
+        where, number = "robot = ? AND epoch = ? AND sequence = ?", (robot, epoch, sequence)
         with self._database.transaction() as database:
-            database.update(PACKETS, {"refusal": reason}, where, number)
+            change_rows(database, PACKETS, {"refusal": reason}, where, number)
 
     def refusals(self, robot: str) -> list[tuple[int, int, str]]:
         """Epoch, number and reason of every refused packet of a robot."""
@@ -345,7 +344,7 @@ class MissionStore:
     def answer(self, number: int, run: str | None, failure: str | None = None) -> None:
         """Store the outcome of a request."""
         with self._database.transaction() as database:
-            database.update(FINALIZATIONS, {"run": run, "failure": failure}, "number = :number", {"number": number})
+            change_rows(database, FINALIZATIONS, {"run": run, "failure": failure}, "number = ?", (number,))
 
     def fact(self, name: str) -> str | None:
         """A stored fact about the mission; None if the mission does not have it."""

@@ -3,7 +3,7 @@
 import os
 import sqlite3
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from hashlib import blake2b
 from pathlib import Path
@@ -26,17 +26,6 @@ class SealedConnection(sqlite3.Connection):
         marks = ", ".join(f"?{number}" for number in range(1, len(table.columns) + 1))
         verb = "INSERT OR REPLACE" if replaces else "INSERT"
         self.executemany(f"{verb} INTO {table.name} VALUES ({marks}, seal('{table.name}', {marks}))", rows)
-
-    def update(
-        self, table: StoreTable, changes: Mapping[str, object], where: str, values: Mapping[str, object]
-    ) -> None:
-        """As in ``Transaction``."""
-        assignments = ", ".join(f"{column} = :new_{column}" for column in changes)
-        sealed = ", ".join(f":new_{column}" if column in changes else column for column in table.columns)
-        self.execute(
-            f"UPDATE {table.name} SET {assignments}, seal = seal('{table.name}', {sealed}) WHERE {where}",
-            {**values, **{f"new_{column}": value for column, value in changes.items()}},
-        )
 
 
 class Database(RowStore):

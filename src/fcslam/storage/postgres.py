@@ -4,12 +4,10 @@ psycopg is an extra of its own, so it is imported when a server is used.
 """
 
 import os
-import re
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import parse_qsl, unquote, urlencode, urlsplit, urlunsplit
 
@@ -28,7 +26,6 @@ ANSWER_S: Final = 10.0
 """A statement that takes longer fails: the server, or the way to it, is gone."""
 MOST_CONNECTIONS: Final = 8
 """Most connections of one process to the server."""
-_MARK: Final = re.compile(r"\?|:([a-z_]+)")
 
 
 class Postgres:
@@ -74,9 +71,7 @@ class Postgres:
             finally:
                 self._give_back(connection)
 
-    def rows(
-        self, statement: str, values: Sequence[object] | Mapping[str, object] = (), schema: str = "fcslam"
-    ) -> list[tuple[Any, ...]]:
+    def rows(self, statement: str, values: Sequence[object] = (), schema: str = "fcslam") -> list[tuple[Any, ...]]:
         """All rows that a query of a schema finds."""
         with self.connection(f"SET search_path TO {schema}") as connection:
             found: list[tuple[Any, ...]] = PostgresTransaction(connection).execute(statement, values).fetchall()
@@ -148,11 +143,9 @@ class PostgresTransaction:
     def __init__(self, connection: "_Connection") -> None:
         self._connection = connection
 
-    def execute(
-        self, statement: str, values: Sequence[object] | Mapping[str, object] = ()
-    ) -> "psycopg.Cursor[tuple[Any, ...]]":
+    def execute(self, statement: str, values: Sequence[object] = ()) -> "psycopg.Cursor[tuple[Any, ...]]":
         """As in ``Transaction``."""
-        return self._connection.execute(_translate(statement), _plain(values), binary=True)
+        return self._connection.execute(statement.replace("?", "%s").encode(), _plain(values), binary=True)
 
     def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
         """As in ``Transaction``."""
@@ -163,14 +156,6 @@ class PostgresTransaction:
             statement += f" ON CONFLICT ({', '.join(table.key)}) DO UPDATE SET {changes}"
         with self._connection.cursor() as cursor:
             cursor.executemany(statement, (_plain(row) for row in rows))
-
-    def update(
-        self, table: StoreTable, changes: Mapping[str, object], where: str, values: Mapping[str, object]
-    ) -> None:
-        """As in ``Transaction``."""
-        assignments = ", ".join(f"{column} = :new_{column}" for column in changes)
-        news = {f"new_{column}": value for column, value in changes.items()}
-        self.execute(f"UPDATE {table.name} SET {assignments} WHERE {where}", {**values, **news})
 
     def stream(self, table: StoreTable) -> Iterator[tuple[Any, ...]]:
         """The rows of a table by its key, a few at a time."""
@@ -214,18 +199,8 @@ def _is_lost(error: "psycopg.OperationalError") -> bool:
     return state is None or state.startswith(("08", "57P"))
 
 
-@lru_cache(maxsize=1000)
-def _translate(statement: str) -> str:
-    """A statement with the driver's marks."""
-    return _MARK.sub(lambda mark: f"%({mark[1]})s" if mark[1] else "%s", statement)
-
-
-def _plain(values: Sequence[object] | Mapping[str, object]) -> Any:
+def _plain(values: Sequence[object]) -> list[object]:
     """Values as the driver takes them: text without NUL, which the server has not, and no class of its own."""
-    if isinstance(values, Mapping):
-        return {name: _value(value) for name, value in values.items()}
-    return [_value(value) for value in values]
-
-
-def _value(value: object) -> object:
-    return str(value).replace("\0", "\N{REPLACEMENT CHARACTER}") if isinstance(value, str) else value
+    return [
+        str(value).replace("\0", "\N{REPLACEMENT CHARACTER}") if isinstance(value, str) else value for value in values
+    ]

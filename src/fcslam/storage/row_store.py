@@ -1,6 +1,6 @@
 """A store of rows, whose tables are in a SQLite file or on a PostgreSQL server.
 
-Statements are written for both: marks are ``?``, or ``:name`` with a mapping.
+Statements are written for both; marks are ``?``.
 """
 
 import threading
@@ -34,10 +34,15 @@ class Transaction(Protocol):
     def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
         """Insert rows, whose REAL values are floats; ``replaces``: in place of those with the same key."""
 
-    def update(
-        self, table: StoreTable, changes: Mapping[str, object], where: str, values: Mapping[str, object]
-    ) -> None:
-        """Change columns of the rows for which ``where`` holds; ``values`` are those of its names."""
+
+def change_rows(
+    transaction: Transaction, table: StoreTable, changes: Mapping[str, object], where: str, values: Sequence[object]
+) -> None:
+    """Change columns of the rows for which ``where`` holds."""
+    columns = ", ".join(table.columns)
+    for row in transaction.execute(f"SELECT {columns} FROM {table.name} WHERE {where}", values).fetchall():
+        changed = {**dict(zip(table.columns, row, strict=True)), **changes}
+        transaction.insert(table, [tuple(changed.values())], replaces=True)
 
 
 class RowStore(ABC):
