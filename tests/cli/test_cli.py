@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from fcslam import __version__, cli
+from fcslam import __version__
 from fcslam.cli import BAD_INPUT, main
 from fcslam.config import Settings, load
 from fcslam.lab.presets import Preset
@@ -109,15 +109,6 @@ def test_wrong_usage_is_exit_code_2_without_a_traceback(capsys, arguments):
     assert error.strip()
 
 
-def test_faults_of_the_program_are_not_hidden(monkeypatch):
-    def broken(*_arguments, **_options):
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(cli, "app", broken)
-    with pytest.raises(ZeroDivisionError):
-        main(["--version"])
-
-
 def test_a_full_disk_behind_stdout_is_one_line():
     command = [sys.executable, "-m", "fcslam.cli", "evaluate", "--help"]
     with Path("/dev/full").open("w", encoding="utf-8") as full:
@@ -133,16 +124,6 @@ def test_a_closed_pipe_behind_stdout_is_silent():
     done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writing)
     assert (done.returncode, done.stderr) == (1, "")
-
-
-def test_ctrl_c_is_one_line_and_130(tmp_path, monkeypatch, capsys):
-    def interrupted(_path):
-        raise KeyboardInterrupt
-
-    Run({}).save(tmp_path / "run")
-    monkeypatch.setattr("fcslam.lab.evaluation.relations.read_relations", interrupted)
-    assert main(["evaluate", "relations", str(tmp_path / "run"), "relations"]) == 130
-    assert capsys.readouterr().err.strip() == "fcslam: interrupted"
 
 
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf"])

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import yaml
 
-from fcslam import api
 from fcslam.cli import main
 from fcslam.cli import map as mapping
 from fcslam.config import dump
@@ -140,10 +139,6 @@ def test_the_configuration_goes_round(logs, run, tmp_path, capsys):
             assert (tmp_path / "again" / path.relative_to(run)).read_bytes() == path.read_bytes(), path.name
 
 
-def test_the_seed_of_the_command_line_wins(run):
-    assert yaml.safe_load((run / "config.yaml").read_text())["seed"] == 5
-
-
 def test_an_empty_folder_takes_a_run_and_force_replaces_one(log, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
@@ -156,38 +151,10 @@ def test_an_empty_folder_takes_a_run_and_force_replaces_one(log, tmp_path):
 # Recordings that are damaged, but not much
 
 
-def damaged(lines, **changes):
-    return [changes.get(f"line_{number}", line) for number, line in enumerate(lines)]
-
-
-TOLERATED = {
-    "a broken line": (damaged(drive(40), line_21="FLASER 8 1.0 rubbish"), ["broken lines skipped: 1 (first: line 22)"]),
-    "a cut last line": ([*drive(40), flaser(108.2, pose_at(41))[:30]], ["broken lines skipped: 1 (first: line 81)"]),
-    "ranges that are no number": (
-        damaged(drive(40), line_21=flaser(102.0, pose_at(10), ranges=(1.0,) * 5 + (float("nan"),) * 3)),
-        ["not finite made invalid: 3 (first: line 22"],
-    ),
-    "negative ranges": (
-        damaged(drive(40), line_21=flaser(102.0, pose_at(10), ranges=(-1.0,) * 8)),
-        ["negative ranges made invalid: 8 (first: line 22)"],
-    ),
-    "a clock that stumbles": (
-        damaged(drive(40), line_21=flaser(101.3, pose_at(10))),
-        ["steps back in time kept: 1 (first: line 22, largest 0.5 s)"],
-    ),
-    "several at once, on one line of their own": (
-        [*damaged(drive(40), line_21="FLASER x", line_31=flaser(103.0, pose_at(15), ranges=(-1.0,) * 8)), "ODOM x"],
-        ["healthy: broken lines skipped: 2 (first: line 22), negative ranges made invalid: 8 (first: line 32)"],
-    ),
-}
-
-
-@pytest.mark.parametrize(("lines", "reports"), TOLERATED.values(), ids=TOLERATED)
-def test_little_damage_is_tolerated_and_reported(tmp_path, capsys, lines, reports):
-    log = save(tmp_path / "healthy.log", lines)
+def test_little_damage_is_tolerated_and_reported(tmp_path, capsys):
+    log = save(tmp_path / "healthy.log", [*drive(40)[:20], "FLASER 8 1.0 rubbish", *drive(40)[20:], "ODOM x"])
     assert run_map(log, "--output", tmp_path / "run") == 0
-    error = capsys.readouterr().err
-    assert all(report in error for report in reports)
+    assert "healthy: broken lines skipped: 2 (first: line 21)" in capsys.readouterr().err
     assert names_in(tmp_path / "run") == RUN_FILES
 
 
@@ -264,24 +231,12 @@ def test_two_recordings_of_one_name_are_refused(tmp_path, log, capsys):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        ("fleet: {join_map: false}", "did you mean 'join_maps'?"),
-        ("sed: 3", "did you mean 'seed'?"),
-        ("seed: -1", "seed"),
-        ("seed: one", "seed"),
-        ("fleet: 3", "fleet"),
-        ("- 1\n- 2", "expected a mapping"),
-        ("{", "not valid YAML"),
-        ("fleet: {consistency: {separation_m: .nan}}", "separation_m"),
-        ("\x00", "YAML"),
-    ],
-)
-def test_a_bad_configuration_is_refused(tmp_path, log, capsys, content, reason):
+@pytest.mark.parametrize("content", ["fleet: {join_map: false}", "- 1\n- 2", "{", "\x00", None])
+def test_a_bad_configuration_is_refused(tmp_path, log, capsys, content):
     config = tmp_path / "config.yaml"
-    config.write_text(content)
-    assert reason in refused(capsys, tmp_path, log, "--config", config, "--output", tmp_path / "run")
+    if content is not None:
+        config.write_text(content)
+    assert "config.yaml" in refused(capsys, tmp_path, log, "--config", config, "--output", tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -296,11 +251,6 @@ def test_a_bad_configuration_is_refused(tmp_path, log, capsys, content, reason):
 )
 def test_a_key_that_is_wrong_is_refused(tmp_path, log, capsys, given, reason):
     assert reason in refused(capsys, tmp_path, log, "--config", given, "--output", tmp_path / "run")
-
-
-def test_a_missing_configuration_is_refused(tmp_path, log, capsys):
-    arguments = (log, "--config", tmp_path / "none.yaml", "--output", tmp_path / "run")
-    assert "cannot read the configuration" in refused(capsys, tmp_path, *arguments)
 
 
 @pytest.mark.parametrize(("force", "reason"), [((), "not a run folder"), (("--force",), "not a run folder")])
@@ -367,21 +317,6 @@ def test_splits_that_cannot_be_are_refused(tmp_path, log, capsys):
     assert not run.exists()
 
 
-def test_relations_that_match_nothing_are_refused(run, tmp_path, capsys):
-    (tmp_path / "relations").write_text("1 2 0.5 0 0 0 0 0\n")
-    assert main(["evaluate", "relations", str(run), str(tmp_path / "relations")]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("fcslam: ")
-    assert error.count("\n") == 1
-
-
-@pytest.mark.parametrize("usage", [("--split", "0"), ("--split", "x"), ("--nonsense",)])
-def test_wrong_usage_is_exit_code_2(tmp_path, log, capsys, usage):
-    assert run_map(log, "--output", tmp_path / "run", *usage) == 2
-    assert "Traceback" not in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize("force", [(), ("--force",)])
 def test_ctrl_c_leaves_no_folder_and_the_old_run_alone(tmp_path, capsys, monkeypatch, force):
     log = save(tmp_path / "long.log", drive(120))
@@ -399,30 +334,6 @@ def test_ctrl_c_leaves_no_folder_and_the_old_run_alone(tmp_path, capsys, monkeyp
     assert capsys.readouterr().err.strip().splitlines()[-1] == "fcslam: interrupted"
     assert names_in(tmp_path) == ({"long.log", "run"} if force else {"long.log"})
     assert not force or {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()} == before
-
-
-def test_ctrl_c_while_writing_leaves_no_folder(tmp_path, log, monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("fcslam.runs.folder.metrics_json", interrupt)
-    assert run_map(log, "--output", tmp_path / "run") == 130
-    assert names_in(tmp_path) == {"healthy.log"}
-
-
-def test_a_disk_that_is_full_is_one_line(tmp_path, log, monkeypatch, capsys):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("fcslam.runs.folder.metrics_json", full)
-    assert "No space left" in refused(capsys, tmp_path, log, "--output", tmp_path / "run")
-    assert names_in(tmp_path) == {"healthy.log"}
-
-
-def test_the_command_refuses_before_the_long_work(tmp_path, log, monkeypatch, capsys):
-    monkeypatch.setattr(api, "run_mission", lambda *_: pytest.fail("worked"))
-    refused(capsys, tmp_path, log, tmp_path / "none.log", "--output", tmp_path / "run")
-    refused(capsys, tmp_path, log, "--output", log / "run")
 
 
 @pytest.mark.parametrize(
@@ -446,14 +357,10 @@ def test_floors_are_those_of_all_recordings_or_of_one(options, floors):
         (["r=1", "r=2"], "r can be on one floor only"),
         (["x=1"], "a floor names 'x', but the robots are r"),
         (["r="], "floor '' is not 1 to 16 of"),
-        (["=1"], "a floor names ''"),
-        (["x@1=1"], "a floor names 'x', but the robots are r"),
         (["r@1=1", "r@1=2"], "r@1 can be on one floor only"),
         (["r@soon=1"], "expected NAME@TIME with seconds after the first scan, such as anna@44"),
         (["r@0=1"], "expected NAME@TIME"),
         (["r@1e9=1"], "a floor begins 1e+09 s after the first scan, but r has"),
-        (["r@1="], "floor '' is not 1 to 16 of"),
-        (["x" * 17], "is not 1 to 16 of"),
         (["a\x1b[2J"], "is not 1 to 16 of"),
     ],
 )

@@ -213,29 +213,25 @@ def test_a_robot_that_has_sent_everything_shows_no_old_count():
     assert "sending" not in text
 
 
-def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives(monkeypatch):
+def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives():
     """The learning process gets each change; a test of its own covers it."""
     told = []
 
     class Process:
-        def __init__(self, plan, robot, _notify):
-            told.append((plan, robot))
-
         def set_idle(self, is_idle):
             told.append(is_idle)
 
         def close(self):
             told.append("closed")
 
-    monkeypatch.setattr("fcslam.learning.federated.learning_process.LearningProcess", Process)
     robot = SimpleNamespace(name="anna", idle=lambda: told.append("keyframes are placed"))
-    with live.standstill_learning("plan", robot, told.append) as follow:
+    with live.standstill_learning(Process(), robot) as follow:
         watch = live.pose_watch(told.append, follow)
         for scan in range(1, 30):
             x = 0.0 if scan < 20 else 1.0
             watch(scan, SimpleNamespace(stamp=float(scan), T_odom_base=np.array((x, 0.0, 0.0)), T_map_base=np.zeros(3)))
             watch(scan, None)  # another record, of no scan
-    assert told == [("plan", "anna"), "keyframes are placed", True, False, "closed"]
+    assert told == ["keyframes are placed", True, False, "closed"]
 
 
 @pytest.mark.parametrize("failure", [CloudError("the token is not known (401)"), InputError("the disk is full")])
@@ -265,13 +261,10 @@ def test_a_live_robot_that_is_turned_away_does_not_lose_its_run(monkeypatch, tmp
     assert f"{len(scans)} scans, 1 sessions" in capsys.readouterr().out
 
 
-def test_a_robot_that_is_turned_away_stops_learning_and_maps_on(monkeypatch):
+def test_a_robot_that_is_turned_away_stops_learning_and_maps_on():
     told = []
 
     class Process:
-        def __init__(self, *_):
-            """No process."""
-
         def set_idle(self, is_idle):
             told.append(is_idle)
 
@@ -281,9 +274,8 @@ def test_a_robot_that_is_turned_away_stops_learning_and_maps_on(monkeypatch):
     def idle():
         raise CloudError("the token is not known (401)")
 
-    monkeypatch.setattr("fcslam.learning.federated.learning_process.LearningProcess", Process)
     robot = SimpleNamespace(name="anna", idle=idle)
-    with live.standstill_learning("plan", robot, told.append) as follow:
+    with live.standstill_learning(Process(), robot) as follow:
         for scan in range(1, 30):
             follow(SimpleNamespace(stamp=float(scan), T_odom_base=np.zeros(3), T_map_base=np.zeros(3)))
     assert True not in told

@@ -12,7 +12,6 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.service.shared.registry import Registry
-from fcslam.storage import postgres as postgres_module
 from tests.postgres import PASSWORD, free_port
 
 WRONG = "no-such-secret"
@@ -30,7 +29,6 @@ def refused(arguments, tmp_path, capsys):
 @pytest.fixture(autouse=True)
 def no_password(monkeypatch):
     monkeypatch.delenv("PGPASSWORD", raising=False)
-    monkeypatch.setattr(postgres_module, "RETRY_S", 0.2)
 
 
 @pytest.mark.parametrize(
@@ -82,11 +80,10 @@ def test_a_store_of_a_newer_version_is_told(postgres, postgres_server, tmp_path,
         postgres.rows("UPDATE version SET number = number - 1 RETURNING 1")
 
 
-def test_a_name_that_is_taken_is_told(postgres, postgres_server, tmp_path, capsys, monkeypatch):
+def test_a_name_that_is_taken_is_told(postgres, postgres_server, tmp_path, capsys):
     postgres.rows("DELETE FROM instances RETURNING 1")
-    monkeypatch.setattr("fcslam.service.shared.instance.NAME_S", 0.5)
     port = free_port()
-    assert Registry(postgres, f"{socket.gethostname()}-{port}", "another process").register(1)
+    assert Registry(postgres, f"{socket.gethostname()}-{port}", "another process", 3600.0).register(1)
     line = refused([postgres_server.url, "--port", str(port)], tmp_path, capsys)
     assert f"another instance is called '{socket.gethostname()}-{port}'" in line
 

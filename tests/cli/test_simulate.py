@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.lab.simulation import engine
 from fcslam.records import CameraImage, LaserScan, Odometry
 from fcslam.runs import open_run, read_tum
 from fcslam.sources import open_source
@@ -77,15 +76,6 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path, capsys):
     assert main([*TINY, "--no-camera", "--output", str(tmp_path)]) == 2
     assert "is not empty; choose another place" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["notes"]
-
-
-def test_without_a_gl_library_one_line_says_so(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(engine, "_BACKENDS", ("none",))
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    assert main([*TINY, "--output", str(tmp_path / "fleet")]) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if line]
-    assert len(lines) == 1
-    assert "apt-get install" in lines[0]
 
 
 @pytest.mark.system

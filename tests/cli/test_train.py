@@ -1,6 +1,7 @@
 """`fcslam tools train`: one small run from images to files, and what it says of bad input."""
 
 import shutil
+import sys
 
 import cv2
 import numpy as np
@@ -131,5 +132,5 @@ def test_a_folder_of_no_use_is_one_line(tmp_path, capsys):
 
 
 def test_without_torch_it_says_what_to_install(photos, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("fcslam.cli.training_options.find_spec", lambda _: None)
+    monkeypatch.setitem(sys.modules, "torch", None)
     assert "pip install 'fcslam[train]'" in complaint(capsys, photos, "-o", tmp_path / "out")

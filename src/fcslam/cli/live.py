@@ -19,7 +19,7 @@ from fcslam.errors import FcslamError, InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fcslam.learning.federated.learning_process import RobotLearningPlan
+    from fcslam.learning.federated.learning_process import LearningProcess, RobotLearningPlan
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotEvent, RobotPose
     from fcslam.live.robot import Robot
@@ -94,7 +94,12 @@ def drive_live(
         heard = ", ".join((*topics.scans, topics.odometry or topics.transforms[0]))
         notify(f"{robot.name}: reads {heard}; Ctrl-C ends the drive and writes {output}")
         with stopping(node.stop):  # also while the run is written: a late SIGTERM must not lose it
-            with standstill_learning(learning, robot, notify) as follow:
+            process = None
+            if learning is not None and not isinstance(robot, LocalizedRobot):
+                from fcslam.learning.federated.learning_process import LearningProcess
+
+                process = LearningProcess(learning, robot.name, notify)
+            with standstill_learning(process, robot) as follow:
                 node.run(pose_watch(notify, follow))
             if not node.scans:
                 notify("no scan was mapped; nothing is written")
@@ -124,18 +129,16 @@ def _finish(robot: "Robot", notify: Callable[[str], None]) -> FcslamError | None
 
 @contextmanager
 def standstill_learning(
-    plan: "RobotLearningPlan | None", robot: "Robot | LocalizedRobot", notify: Callable[[str], None]
+    learning: "LearningProcess | None", robot: "Robot | LocalizedRobot"
 ) -> "Iterator[Callable[[RobotPose], None]]":
-    """Let the robot learn while it stands still, if there is a plan for it; gives what follows its poses."""
+    """Let a process learn while its robot stands still, if there is one; gives what follows the robot's poses."""
     from fcslam.live.localized_robot import LocalizedRobot
-
-    if plan is None or isinstance(robot, LocalizedRobot):
-        yield lambda _pose: None
-        return
-    from fcslam.learning.federated.learning_process import LearningProcess
     from fcslam.live.standstill import Standstill
 
-    with closing(LearningProcess(plan, robot.name, notify)) as learning:
+    if learning is None or isinstance(robot, LocalizedRobot):
+        yield lambda _pose: None
+        return
+    with closing(learning):
 
         def stop() -> None:
             try:
