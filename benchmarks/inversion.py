@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.features.classical import OrbConfig, make_detector
+from fcslam.features.classical import make_detector
 from fcslam.features.detector import FeatureDetector, OnnxConfig
 from fcslam.learning.images import find_images, read_image
 from fcslam.mission.mission import MissionConfig
@@ -65,7 +65,7 @@ def main() -> None:
     folder = common.recordings(*PHOTOGRAPHS, *(f"ie_tower/{floor}" for floor in FLOORS), kind="vision")
     report = common.Report(__file__, __doc__, chosen)
     views = MissionConfig().robot.views
-    detector = make_detector(views.detector, OrbConfig(), OnnxConfig(weights=views.weights))
+    detector = make_detector(views.detector, OnnxConfig(weights=views.weights))
     known = [seen for name in PHOTOGRAPHS for seen in look([folder / name], chosen.photographs, detector)]
     grey = float(np.mean([seen.image.mean() for seen in known]))
     attacks = {"nearest code": nearest_code(known), "regression": regression(known)}

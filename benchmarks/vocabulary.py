@@ -72,10 +72,10 @@ def describe_images(folder: Path, target: Path) -> None:
     """Write the descriptors (P, 300, 32) of all images that have so many."""
     import numpy as np
 
-    from fcslam.features.classical import Orb, OrbConfig
+    from fcslam.features.classical import Orb
     from fcslam.features.files import read_grey
 
-    orb = Orb(OrbConfig(most_features=DESCRIPTORS))
+    orb = Orb(most_features=DESCRIPTORS)
     paths = sorted(path for name in IMAGES for path in (folder / name).rglob("*.jpg"))
     described = [orb.detect(read_grey(path)).descriptors[:DESCRIPTORS] for path in paths]
     kept = np.stack([codes for codes in described if len(codes) == DESCRIPTORS])
@@ -171,7 +171,7 @@ def words_row(method: str, index: Any, descriptors: Any) -> tuple:
     from fcslam.places.kmeans_tree import find_leaves
 
     codes = code_words(np.resize(descriptors, (1_000, 32)))
-    tree = index._vocabulary.tree
+    tree = index.vocabulary.tree
     return method, len(index), np.median([timed_ms(lambda: find_leaves(tree, codes)) for _ in range(20)])
 
 

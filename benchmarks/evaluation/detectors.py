@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from fcslam.errors import InputError
-from fcslam.features.classical import Orb, OrbConfig
+from fcslam.features.classical import Orb
 from fcslam.features.detector import (
     BUNDLED_NETWORK,
     MATCHING_SCALES,
@@ -176,7 +176,7 @@ def _classical(name: EvaluatedDetectorKind) -> EvaluatedDetector:
         EvaluatedDetectorKind.HARRIS: Harris(),
         EvaluatedDetectorKind.SHI: ShiTomasi(),
         EvaluatedDetectorKind.SIFT: Sift(_CANDIDATES),
-        EvaluatedDetectorKind.ORB: Orb(OrbConfig(most_features=_CANDIDATES, fast_threshold=20)),
+        EvaluatedDetectorKind.ORB: Orb(most_features=_CANDIDATES, fast_threshold=20),
     }
     return _run_here(name.value, detectors[name].detect)
 

@@ -16,7 +16,7 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.compiled import njit
 from fcslam.errors import FeatureError, InputError
-from fcslam.features.classical import Orb, OrbConfig
+from fcslam.features.classical import Orb
 from fcslam.features.codes import code_words, hamming_matrix, mutual_matches
 from fcslam.features.detector import FeatureDetector, ImageFeatures, OnnxConfig, OnnxDetector
 from fcslam.features.detector_kinds import DetectorKind
@@ -287,7 +287,7 @@ def choose_features(choice: str) -> FeatureChoice:
     """
     path = Path(choice)
     if choice == DetectorKind.ORB:
-        return FeatureChoice(choice, Orb(OrbConfig(most_features=FEATURES_PER_IMAGE, fast_threshold=FAST_THRESHOLD)))
+        return FeatureChoice(choice, Orb(most_features=FEATURES_PER_IMAGE, fast_threshold=FAST_THRESHOLD))
     if choice == DetectorKind.ONNX or path.is_file():
         weights = None if choice == DetectorKind.ONNX else path
         network = OnnxDetector(OnnxConfig(weights=weights, most_features=FEATURES_PER_IMAGE))

@@ -9,8 +9,7 @@ from fcslam.geometry import se2
 from tests.rooms import asymmetric_room
 
 
-def test_the_picture_is_the_likelihood_of_the_nearest_point(monkeypatch):
-    monkeypatch.setattr("fcslam.features.birdseye._SIDE_CELLS", 80)
+def test_the_picture_is_the_likelihood_of_the_nearest_point():
     rng = np.random.default_rng(0)
     points = (rng.integers(-200, 200, (60, 2)) + 0.5) * 0.025  # where a quarter of a cell has its middle
     inside = points[(np.abs(points) < 4.0).all(axis=1)]
@@ -18,7 +17,7 @@ def test_the_picture_is_the_likelihood_of_the_nearest_point(monkeypatch):
     centres = (np.stack((columns, rows), axis=-1) + 0.5) * 0.1 - 4.0
     distances_m = cKDTree(inside).query(centres)[0]
     field = 255.0 * np.exp(-(distances_m**2) / (2.0 * 0.35**2))
-    np.testing.assert_allclose(likelihood_picture(points), field, atol=0.51)
+    np.testing.assert_allclose(likelihood_picture(points, 80), field, atol=0.51)
 
 
 def test_a_point_lies_in_the_middle_of_its_likelihood():
@@ -53,12 +52,11 @@ def test_matched_keypoints_lie_where_the_motion_puts_them(angle):
     assert np.median(errors[errors < 0.3]) < 0.1
 
 
-def test_the_strongest_are_kept_and_the_order_of_points_does_not_matter(monkeypatch):
-    monkeypatch.setattr("fcslam.features.birdseye._MOST_FEATURES", 50)
+def test_the_strongest_are_kept_and_the_order_of_points_does_not_matter():
     rng = np.random.default_rng(3)
     points = asymmetric_room(rng)
-    features = describe(points)
-    shuffled = describe(rng.permutation(points))
+    features = describe(points, 50)
+    shuffled = describe(rng.permutation(points), 50)
     assert len(features.keypoints_m) == 50
     assert features.keypoints_m.dtype == np.float32
     assert features.descriptors.shape == (50, 32)

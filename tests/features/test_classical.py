@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.features.classical import ORB_VERSION, Orb, OrbConfig
+from fcslam.features.classical import ORB_VERSION, Orb
 from fcslam.features.codes import mutual_matches
 from fcslam.features.detector import decode_grey
 from tests.features.pictures import picture
@@ -19,14 +19,14 @@ def image():
 
 
 def test_the_same_image_gives_the_same_features(image):
-    first, second = Orb(OrbConfig()).detect(image), Orb(OrbConfig()).detect(image)
+    first, second = Orb().detect(image), Orb().detect(image)
     assert np.array_equal(first.descriptors, second.descriptors)
     assert np.array_equal(first.keypoints_px, second.keypoints_px)
-    assert Orb(OrbConfig()).version == ORB_VERSION
+    assert Orb().version == ORB_VERSION
 
 
 def test_features_are_as_many_as_asked_the_strongest_first_and_inside(image):
-    features = Orb(OrbConfig(most_features=120)).detect(image)
+    features = Orb(most_features=120).detect(image)
     assert 60 < len(features.scores) <= 120
     assert features.descriptors.shape == (len(features.scores), 32)
     assert np.all(np.diff(features.scores) <= 0.0)
@@ -37,7 +37,7 @@ def test_a_shifted_image_gives_shifted_keypoints_with_the_same_codes(image):
     """(0, 0) is the centre of the first pixel, at every scale of the pyramid."""
     dx, dy = 24, 16
     shifted = np.roll(image, (dy, dx), (0, 1))
-    a, b = Orb(OrbConfig()).detect(image), Orb(OrbConfig()).detect(shifted)
+    a, b = Orb().detect(image), Orb().detect(shifted)
     matches = mutual_matches(a.descriptors, b.descriptors, 20)
     moved = b.keypoints_px[matches.pairs[:, 1]] - a.keypoints_px[matches.pairs[:, 0]]
     assert len(moved) > 100
@@ -46,7 +46,7 @@ def test_a_shifted_image_gives_shifted_keypoints_with_the_same_codes(image):
 
 @pytest.mark.parametrize("level", [0, 128])
 def test_nothing_to_see_is_no_feature(level):
-    features = Orb(OrbConfig()).detect(np.full((240, 320), level, np.uint8))
+    features = Orb().detect(np.full((240, 320), level, np.uint8))
     assert features.descriptors.shape == (0, 32)
     assert features.keypoints_px.shape == (0, 2)
 
@@ -61,7 +61,7 @@ def test_broken_images_are_told(image):
 def test_coarse_keypoints_lie_where_fine_ones_do(image):
     """Mirrored pictures have mirrored keypoints: a position that is off to one side at coarse levels would show."""
     blurred = cv2.GaussianBlur(image, (0, 0), 2.5)  # corners of coarse levels
-    there, back = (Orb(OrbConfig(fast_threshold=3)).detect(view).keypoints_px for view in (blurred, blurred[:, ::-1]))
+    there, back = (Orb(fast_threshold=3).detect(view).keypoints_px for view in (blurred, blurred[:, ::-1]))
     back = np.column_stack((image.shape[1] - 1 - back[:, 0], back[:, 1]))
     away = there[:, None] - back
     nearest = np.linalg.norm(away, axis=2).argmin(axis=1)

@@ -6,7 +6,7 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import FeatureError
-from fcslam.features.classical import Orb, OrbConfig, make_detector
+from fcslam.features.classical import Orb, make_detector
 from fcslam.features.detector import NO_FEATURES, OnnxConfig
 from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.files import extract, read_features, read_grey, write_features
@@ -77,11 +77,11 @@ def test_the_file_is_as_documented(images, tmp_path):
 
 def test_larger_images_are_shrunk_and_keypoints_are_in_their_own_pixels(image):
     large = cv2.resize(image, (1280, 960), interpolation=cv2.INTER_NEAREST)
-    small = Orb(OrbConfig()).detect(image)
-    found = extract(large, Orb(OrbConfig()), 320)
+    small = Orb().detect(image)
+    found = extract(large, Orb(), 320)
     assert np.array_equal(found.descriptors, small.descriptors)
     assert np.allclose(found.keypoints_px, 4.0 * small.keypoints_px + 1.5)  # pixel 0 became pixels 0 to 3
-    assert extract(image, Orb(OrbConfig()), 320).keypoints_px.tolist() == small.keypoints_px.tolist()
+    assert extract(image, Orb(), 320).keypoints_px.tolist() == small.keypoints_px.tolist()
 
 
 def test_networks_extract_as_well(images, tmp_path, capsys):
@@ -147,7 +147,7 @@ def test_features_of_other_programs_are_checked(tmp_path, change, message):
 
 
 def test_what_is_written_is_read_again_the_strongest_first(tmp_path, image):
-    features = Orb(OrbConfig()).detect(image)
+    features = Orb().detect(image)
     write_features(tmp_path / "f.npz", features.take(np.arange(len(features.scores))[::-1]), (320, 240))
     again, size = read_features(tmp_path / "f.npz")
     assert size == (320, 240)
@@ -156,7 +156,7 @@ def test_what_is_written_is_read_again_the_strongest_first(tmp_path, image):
 
 
 def test_taking_some_takes_all_that_is_known_of_them(image):
-    features = Orb(OrbConfig()).detect(image)
+    features = Orb().detect(image)
     some = features.take(np.array([5, 2]))
     assert np.array_equal(some.descriptors, features.descriptors[[5, 2]])
     assert np.array_equal(some.scores, features.scores[[5, 2]])
@@ -170,7 +170,7 @@ def test_the_strongest_keypoints_of_all_scales_are_kept(images, tmp_path):
 
     def found(*scales):
         config = OnnxConfig(weights=tmp_path / "n.onnx", most_features=50, scales=scales)
-        return make_detector(DetectorKind.ONNX, OrbConfig(), config).detect(grey)
+        return make_detector(DetectorKind.ONNX, config).detect(grey)
 
     one, half, both = found(1.0), found(0.5), found(1.0, 0.5)
     assert half.scores.max() <= 0.5

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fcslam.errors import FeatureError
-from fcslam.features.classical import Orb, OrbConfig, make_detector
+from fcslam.features.classical import Orb, make_detector
 from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector
 from fcslam.features.detector_kinds import DetectorKind
 from tests.features.networks import tiny_network
@@ -170,8 +170,8 @@ def test_a_bare_name_of_no_bundled_network_is_a_file(tmp_path, weights, monkeypa
 
 def test_the_kind_chooses(weights):
     onnx = OnnxConfig(weights=weights)
-    assert make_detector(DetectorKind.ONNX, OrbConfig(), onnx).version == "tiny-1"
-    assert isinstance(make_detector(DetectorKind.ORB, OrbConfig(), onnx), Orb)
+    assert make_detector(DetectorKind.ONNX, onnx).version == "tiny-1"
+    assert isinstance(make_detector(DetectorKind.ORB, onnx), Orb)
 
 
 @pytest.mark.slow

@@ -62,8 +62,8 @@ def algorithm_1(all_codes, delta):
     """{(i, j): Sim} of all pairs of two robots with M_ij = 1; the k-means trees are those of the index."""
     index, matches = PlaceIndex[int](PAPER.vocabulary, np.random.default_rng(0)), {}
     for j, codes in enumerate(all_codes):
-        if index.training is not None:
-            tree = index._vocabulary.tree
+        if index.trained_on is not None:
+            tree = index.vocabulary.tree
             words = [[word_of(tree, code) for code in others.view(np.uint64)] for others in all_codes[:j]]
             documents = Counter(word for of_place in words for word in set(of_place))
             query = bag([word_of(tree, code) for code in codes.view(np.uint64)], documents, j)

@@ -1,7 +1,5 @@
 """Place in, M_ij out: words or nearness propose, the submaps decide."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,6 @@ from fcslam.lidar.pair_verification import verify_here
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.verification import NO_PRIOR, VERIFICATION
 from fcslam.places import matcher as matcher_module
-from fcslam.places import motions
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
 from fcslam.places.motions import Motion
 from fcslam.places.vocabulary import VocabularyConfig
@@ -69,8 +66,7 @@ def test_the_same_room_from_another_pose_is_the_same_place(visits):
     assert len(matcher) == 2
 
 
-def test_another_room_is_another_place(visits, monkeypatch):
-    monkeypatch.setattr(motions, "LEAST_INLIERS", 4)
+def test_another_room_is_another_place(visits):
     matcher = visits.matcher()
     matcher.match(visits.visit("a", 0, room(), POSE_A), {}, STRANGERS)
     matches = matcher.match(visits.visit("b", 0, other_room(), (0.5, 0.5, 1.0)), {}, STRANGERS)
@@ -129,18 +125,21 @@ def test_a_wrong_prediction_does_not_become_a_closure(visits):
     assert match.reason.code is not ReasonCode.VERIFIED
 
 
-def test_a_known_start_needs_fewer_points(visits, monkeypatch):
+def test_a_known_start_needs_fewer_points(visits):
+    asked = []
+
+    def verify(pairs, config):
+        asked.append(config.loose.count)
+        return verify_here(pairs, config)
+
     truth = se2.between(POSE_A, POSE_B)
     first, second = visits.visit("a", 0, room(), POSE_A), visits.visit("b", 0, room(), POSE_B)
-    for count, is_match in ((700, True), (3000, False)):  # a third of them is enough
-        strict, loose = (replace(gate, count=count) for gate in (VERIFICATION.strict, VERIFICATION.loose))
-        monkeypatch.setattr("fcslam.places.matcher.VERIFICATION", replace(VERIFICATION, strict=strict, loose=loose))
-        matcher = visits.matcher()
-        matcher.match(first, {}, STRANGERS)
-        found = matcher.match_at(second, {first.id: se2.compose(truth, (0.2, -0.2, 0.05))})
-        assert [match.M for match in found] == [True] * is_match
-        assert all(np.all(np.abs(se2.between(truth, match.T_i_j)) < (0.03, 0.03, 0.01)) for match in found)
-        assert not any(match.M for match in matcher.match(second, {}, STRANGERS))
+    matcher = PlaceMatcher(MatcherConfig(), visits.submap_of, np.random.default_rng(0), verify_pairs=verify)
+    matcher.match(first, {}, STRANGERS)
+    (match,) = matcher.match_at(second, {first.id: se2.compose(truth, (0.2, -0.2, 0.05))})
+    assert np.all(np.abs(se2.between(truth, match.T_i_j)) < (0.03, 0.03, 0.01))
+    assert not match.predicted
+    assert asked[-1] == round(VERIFICATION.loose.count / 3)
 
 
 def test_a_known_start_makes_no_place_of_another_room(visits):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.features.classical import Orb, OrbConfig
+from fcslam.features.classical import Orb
 from fcslam.features.lidar_depth import LidarView, locate_keypoints
 from fcslam.geometry import se2
 from fcslam.places import motions
@@ -33,7 +33,7 @@ def planted(count=40, channel=Channel.CAMERA, seed=0):
 
 def viewed(robot, pose):
     """A robot's view of the room, as a camera place."""
-    features = Orb(OrbConfig()).detect(picture(pose, room()))
+    features = Orb().detect(picture(pose, room()))
     scan = scan_at(pose, room(), LASER)
     positions, placed = locate_keypoints(
         features.keypoints_px, CAMERA, LidarView(scan.points, scan.origin, LASER.angle_increment_rad)
@@ -49,12 +49,11 @@ def test_planted_motions_are_found(channel):
     assert first.share == 1.0
 
 
-def test_keypoints_at_other_heights_do_not_match(monkeypatch):
+@pytest.mark.parametrize(("height_m", "count"), [(0.05, 1), (0.3, 0)])
+def test_keypoints_at_other_heights_do_not_match(height_m, count):
     a, b = planted()
-    lifted = replace(b, keypoints=frozen(b.keypoints + np.array([0.0, 0.0, 0.3]), np.float32))
-    assert propose_motions(a, lifted) == []
-    monkeypatch.setattr(motions, "LARGEST_LEVEL_M", 0.4)
-    assert len(propose_motions(a, lifted)) == 1
+    lifted = replace(b, keypoints=frozen(b.keypoints + np.array([0.0, 0.0, height_m]), np.float32))
+    assert len(propose_motions(a, lifted)) == count
 
 
 def test_too_few_keypoints_say_nothing():

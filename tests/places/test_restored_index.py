@@ -17,11 +17,7 @@ def places(seed=0):
     return list(centres[rng.integers(0, 30, (2 * COUNT, 40))] ^ flips)
 
 
-def filled(strategy=Strategy.INCREMENTAL, scoring=Scoring.WORDS):
-    config = VocabularyConfig(
-        strategy=strategy, scoring=scoring, train_batch=4, leaf_capacity=16,
-        tree=TreeConfig(branching=4),
-    )  # fmt: skip
+def filled(config):
     index = PlaceIndex[KeyscanId](config, np.random.default_rng(2))
     for number, place in enumerate(places()[:COUNT]):
         index.add(KeyscanId("a", number), place)
@@ -34,13 +30,15 @@ def filled(strategy=Strategy.INCREMENTAL, scoring=Scoring.WORDS):
 @pytest.mark.parametrize("strategy", list(Strategy))
 @pytest.mark.parametrize("scoring", list(Scoring))
 def test_a_restored_index_goes_on_as_the_original(strategy, scoring):
-    index = filled(strategy, scoring)
+    tree = TreeConfig(branching=4)
+    config = VocabularyConfig(strategy=strategy, scoring=scoring, train_batch=4, leaf_capacity=16, tree=tree)
+    index = filled(config)
     kept = [number for number in range(COUNT) if number % 2 or number >= 30]
     ids, descriptors = [KeyscanId("a", number) for number in kept], [places()[number] for number in kept]
-    other = PlaceIndex.restored(index._config, index.state(), ids, descriptors)
+    other = PlaceIndex.restored(config, index.state(), ids, descriptors)
     for step, place in enumerate(places()[COUNT:]):
         assert (len(other), other.word_count, other.version) == (len(index), index.word_count, index.version)
-        assert other.training == index.training
+        assert other.trained_on == index.trained_on
         found, expected = other.query(place, 100), index.query(place, 100)
         assert [f.similarity for f in found] == pytest.approx([f.similarity for f in expected], abs=1e-9)
         assert dict(found) == pytest.approx(dict(expected), abs=1e-9)

@@ -27,14 +27,14 @@ def extract(
 ) -> None:
     """Find keypoints in images and describe each with 256 bits."""
     from fcslam.cli.progress import ProgressDisplay
-    from fcslam.features.classical import OrbConfig, make_detector
+    from fcslam.features.classical import make_detector
     from fcslam.features.detector import OnnxConfig
     from fcslam.features.files import extract_all, find_files
 
     named = detector in list(DetectorKind)
     kind = DetectorKind(detector) if named else DetectorKind.ONNX
     onnx = OnnxConfig(weights=None if named else Path(detector), most_features=keypoints, scales=(1.0, 0.71, 0.5))
-    finder = make_detector(kind, OrbConfig(most_features=keypoints), onnx)
+    finder = make_detector(kind, onnx)
     files = [path for path in find_files(images) if path.suffix != ".npz"]  # an earlier output may be among them
     root = images.parent if images.is_file() else images
     output = output or new_folder(FEATURES)
@@ -43,12 +43,12 @@ def extract(
     outcomes = extract_all(files, root, output, finder, longest_side_px)
     with ProgressDisplay(console) as display:
         extracted_one = display.start("extracting", len(files))
-        for outcome in outcomes:
+        for _, found in outcomes:
             extracted_one()
-            if outcome.skipped:
-                print_line(console, f"skipped: {outcome.skipped}")
+            if isinstance(found, str):
+                print_line(console, f"skipped: {found}")
                 continue
-            done, empty = done + 1, empty + (not outcome.keypoints)
+            done, empty = done + 1, empty + (not found)
     if not done:
         raise FeatureError(f"{images}: no usable image there, {len(files)} files skipped; give JPEG, PNG, PPM or TIFF")
     without = f", {empty} of them without a keypoint" if empty else ""

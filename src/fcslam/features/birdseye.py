@@ -29,22 +29,12 @@ _CELL_M = 0.1
 _SIDE_CELLS = round(SIDE_M / _CELL_M)
 _FIELD_SIGMA_M = 0.35
 """Standard deviation of the likelihood field around a wall."""
-_MOST_FEATURES = 400
-"""Most features of a submap, the strongest corners first."""
-_CORNER_QUALITY = 0.003
-"""Weakest corner response, as a share of the strongest one."""
 _PATCH_RADIUS_M = 1.5
 """Radius of the patch that a descriptor describes."""
 _ORIENTATION_RADIUS_M = 0.8
 """Radius of the disc whose centroid orients a descriptor."""
-_FIELD_REACH = 3.6
-"""Standard deviations beyond which the field is zero, because it is below half a grey level there."""
 _SUBCELLS = 4
 """Positions of a point are rounded to 1 / 4 of a cell."""
-_CORNER_BLOCK_CELLS = 3
-"""Side of the window of the corner detector, in cells."""
-_PAIR_LENGTHS = (0.15, 0.75)
-"""Shortest and longest distance of two compared points, in radii of the patch."""
 
 Picture = NDArray[np.uint8]
 
@@ -59,8 +49,8 @@ class BirdseyeFeatures:
     """Shape (K, 32)."""
 
 
-def describe(points: FloatArray) -> BirdseyeFeatures:
-    """Detect and describe the features of a submap; K = 0 if the picture has no corner.
+def describe(points: FloatArray, most: int = 400) -> BirdseyeFeatures:
+    """Detect and describe the ``most`` strongest features of a submap; K = 0 if the picture has no corner.
 
     The points (N, 2), in metres in the submap's coordinate frame, are one per 5-10 cm of wall. Those that are not
     finite or outside the picture are ignored.
@@ -68,9 +58,7 @@ def describe(points: FloatArray) -> BirdseyeFeatures:
     OpenCV's thread count is not changed, because it belongs to the whole process. The features do not depend on it.
     """
     picture = likelihood_picture(points)
-    corners = cv2.goodFeaturesToTrack(
-        picture, _MOST_FEATURES, _CORNER_QUALITY, minDistance=0, blockSize=_CORNER_BLOCK_CELLS
-    )
+    corners = cv2.goodFeaturesToTrack(picture, most, qualityLevel=0.003, minDistance=0, blockSize=3)
     if corners is None:
         return BirdseyeFeatures(frozen(np.empty((0, 2)), np.float32), frozen(np.empty((0, CODE_BYTES)), np.uint8))
     pixels = corners.reshape(-1, 2).astype(np.int64)
@@ -79,14 +67,14 @@ def describe(points: FloatArray) -> BirdseyeFeatures:
     return BirdseyeFeatures(frozen(pixels_to_metres(pixels), np.float32), frozen(codes, np.uint8))
 
 
-def likelihood_picture(points: FloatArray) -> Picture:
-    """The likelihood field of points (N, 2), metres in the submap's coordinate frame, shape (rows, columns).
+def likelihood_picture(points: FloatArray, side: int = _SIDE_CELLS) -> Picture:
+    """The likelihood field of points (N, 2), metres in the submap's coordinate frame, shape (side, side).
 
     It is ``255 exp(-d^2 / (2 sigma^2))`` with d the distance to the nearest point.
     """
-    cells = points / _CELL_M + 0.5 * _SIDE_CELLS
-    inside = cells[((cells >= 0.0) & (cells < _SIDE_CELLS)).all(axis=1)]
-    picture: Picture = _stamp(inside, _likelihood_discs(), _SIDE_CELLS)
+    cells = points / _CELL_M + 0.5 * side
+    inside = cells[((cells >= 0.0) & (cells < side)).all(axis=1)]
+    picture: Picture = _stamp(inside, _likelihood_discs(), side)
     return picture
 
 
@@ -103,7 +91,7 @@ def pixels_to_metres(pixels: FloatArray | NDArray[np.int64]) -> FloatArray:
 def _likelihood_discs() -> NDArray[np.uint8]:
     """The field around a point for every subcell position of the point: shape (S, S, width, width), y before x."""
     sigma_cells = _FIELD_SIGMA_M / _CELL_M
-    reach = int(_FIELD_REACH * sigma_cells) + 1
+    reach = int(3.6 * sigma_cells) + 1  # beyond, the field is below half a grey level
     places = (np.arange(_SUBCELLS) + 0.5) / _SUBCELLS - 0.5
     squares = (np.arange(-reach, reach + 1) - places[:, None]) ** 2
     fields = np.exp(-0.5 * (squares[:, None, :, None] + squares[None, :, None, :]) / sigma_cells**2)
@@ -120,7 +108,7 @@ def _comparison_pattern() -> FloatArray:
     golden = 1.0
     for _ in range(64):
         golden = (1.0 + golden) ** 0.2
-    shortest, longest = _PAIR_LENGTHS
+    shortest, longest = 0.15, 0.75  # distance of two compared points, in radii of the patch
     steps = np.array([golden**-1, golden**-2, golden**-3, golden**-4])
     u = (0.5 + np.arange(1, 4 * CODE_BITS)[:, None] * steps) % 1.0
     start = np.sqrt(u[:, 0]) * np.exp(2j * np.pi * u[:, 1])

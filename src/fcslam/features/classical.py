@@ -1,7 +1,6 @@
 """OpenCV's ORB, and the choice between it and the network: its descriptors are binary too."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import cv2
@@ -29,25 +28,13 @@ PYRAMID_LEVELS = 8
 """Levels of ORB's image pyramid, each 1.2 times coarser than the one before."""
 
 
-@dataclass(frozen=True, slots=True)
-class OrbConfig:
-    """The ORB detector. Places from different settings cannot be compared."""
-
-    most_features: int = 300
-    """Most features of an image, the strongest first."""
-    fast_threshold: int = 7
-    """Smallest contrast of a FAST corner, in grey levels of 255; low for dim light."""
-
-
 class Orb:
     """Oriented FAST corners with rotated BRIEF codes (Rublee et al. 2011)."""
 
-    def __init__(self, config: OrbConfig) -> None:
+    def __init__(self, most_features: int = 300, fast_threshold: int = 7) -> None:
+        """``fast_threshold``: smallest contrast of a FAST corner, in grey levels of 255; low for dim light."""
         self._orb = cv2.ORB.create(
-            nfeatures=config.most_features,
-            scaleFactor=_PYRAMID_STEP,
-            nlevels=PYRAMID_LEVELS,
-            fastThreshold=config.fast_threshold,
+            nfeatures=most_features, scaleFactor=_PYRAMID_STEP, nlevels=PYRAMID_LEVELS, fastThreshold=fast_threshold
         )
 
     @property
@@ -79,6 +66,6 @@ def ranked(positions: FloatArray, responses: FloatArray) -> tuple[Keypoints, NDA
     return Keypoints(frozen(positions[order], np.float32), frozen(responses[order], np.float32)), order
 
 
-def make_detector(kind: DetectorKind, orb: OrbConfig, onnx: OnnxConfig) -> FeatureDetector:
-    """Make a detector of the given kind; only its own settings are used."""
-    return OnnxDetector(onnx) if kind is DetectorKind.ONNX else Orb(orb)
+def make_detector(kind: DetectorKind, onnx: OnnxConfig) -> FeatureDetector:
+    """Make a detector of the given kind; ORB takes the number of features alone from the settings."""
+    return OnnxDetector(onnx) if kind is DetectorKind.ONNX else Orb(onnx.most_features)

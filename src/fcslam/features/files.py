@@ -5,7 +5,6 @@ float32; ``descriptors`` (N, 32) uint8, the bits packed; ``image_size`` (2,), wi
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +18,6 @@ from fcslam.untrusted import Arrays, read_arrays, read_bytes
 
 _ARRAYS = ("keypoints", "scores", "descriptors", "image_size")
 
-MOST_IMAGE_BYTES = 1 << 28
-"""Largest image file that is read."""
-
 
 def read_grey(path: Path) -> GreyImage:
     """Read the grey levels (H, W) of an image file.
@@ -30,7 +26,7 @@ def read_grey(path: Path) -> GreyImage:
         FeatureError: the file cannot be read, is not an image, or is too large.
     """
     try:
-        encoded = read_bytes(path, most=MOST_IMAGE_BYTES)
+        encoded = read_bytes(path, most=1 << 28)
     except OSError as error:
         raise FeatureError(f"{path}: cannot be read ({error})") from error
     if _longer_side(encoded) > MAX_SIDE_PX:
@@ -90,16 +86,6 @@ def _longer_side(encoded: bytes) -> int:
         return 0
 
 
-@dataclass(frozen=True, slots=True)
-class Extraction:
-    """Result of one file."""
-
-    path: Path
-    keypoints: int
-    skipped: str = ""
-    """Why no features were written; empty if they were."""
-
-
 def find_files(images: Path) -> list[Path]:
     """Return the file itself, or all files in the folder and its subfolders, sorted."""
     files = [images] if images.is_file() else sorted(path for path in images.rglob("*") if path.is_file())
@@ -110,10 +96,10 @@ def find_files(images: Path) -> list[Path]:
 
 def extract_all(
     files: list[Path], root: Path, output: Path, detector: FeatureDetector, longest_side_px: int
-) -> Iterator[Extraction]:
+) -> Iterator[tuple[Path, int | str]]:
     """Write the features of each image below ``output``, at the image's path relative to ``root``.
 
-    Files that cannot be read are skipped and reported.
+    Gives each file with the number of its keypoints, or with the reason why it is skipped.
     """
     written: dict[Path, Path] = {}
     for path in files:
@@ -123,12 +109,12 @@ def extract_all(
                 raise FeatureError(f"{path}: has the features' name in common with {written[target]}; rename one")
             image = read_grey(path)
         except FeatureError as error:
-            yield Extraction(path, 0, str(error))
+            yield path, str(error)
             continue
         features = extract(image, detector, longest_side_px)
         write_features(target, features, (image.shape[1], image.shape[0]))
         written[target] = path
-        yield Extraction(path, len(features.scores))
+        yield path, len(features.scores)
 
 
 def extract(image: GreyImage, detector: FeatureDetector, longest_side_px: int) -> ImageFeatures:

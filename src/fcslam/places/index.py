@@ -1,7 +1,6 @@
 """The place index: an inverted index over a dynamic vocabulary that retrieves the places most similar to a query."""
 
 from collections.abc import Callable, Container, Sequence
-from dataclasses import asdict
 from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -12,7 +11,7 @@ from fcslam.places.kmeans_tree import TreeShape
 from fcslam.places.postings import GROWTH_FACTOR, Postings
 from fcslam.places.scoring import TINY, empty_buffers, score_matches, score_words
 from fcslam.places.similarity import BagOfWords
-from fcslam.places.vocabulary import Scoring, Strategy, Training, TreeState, Vocabulary, VocabularyConfig
+from fcslam.places.vocabulary import Scoring, Strategy, Vocabulary, VocabularyConfig
 from fcslam.records import Codes, FloatArray, frozen
 from fcslam.storage.state_file import State
 
@@ -24,8 +23,6 @@ _MOST_LEVELS = 16
 """Depth limit of a tree whose leaves split; no tree reaches it in practice."""
 _MERGED_SHARE = 4
 """A merged word holds at most 1 / 4 of ``leaf_capacity``, so that it does not split again soon."""
-_ROWS_KEPT = 2
-"""Most rows per stored place. Beyond, the index is compacted: rows of forgotten places go."""
 _NO_CODES = np.empty((0, CODE_WORDS), np.uint64)
 
 
@@ -99,14 +96,15 @@ class PlaceIndex(Generic[PlaceId]):
 
     def __init__(self, config: VocabularyConfig, rng: np.random.Generator) -> None:
         self._config = config
-        self._vocabulary = Vocabulary(_shape(config), int(rng.integers(0, 2**63)))
-        self._postings = self._no_postings()
+        self.vocabulary = Vocabulary(_shape(config), int(rng.integers(0, 2**63)))
+        self.postings = self._no_postings()
+        """What the words of the vocabulary hold, by row."""
         self._buffers = empty_buffers(0)
         self._ids: list[PlaceId] = []
         """Identifier of each row; that of a forgotten place stays until the index is compacted."""
         self._row_of: dict[PlaceId, int] = {}
         self._places_seen = 0
-        self._training: Training | None = None
+        self._trained_on: int | None = None
 
     def __len__(self) -> int:
         return len(self._row_of)
@@ -117,31 +115,31 @@ class PlaceIndex(Generic[PlaceId]):
     @property
     def word_count(self) -> int:
         """Number of words; 0 before the first training."""
-        return self._vocabulary.word_count if self._training else 0
+        return self.vocabulary.word_count if self._trained_on is not None else 0
 
     @property
     def version(self) -> int:
         """Number of changes of the vocabulary; 0 before the first training."""
-        return self._vocabulary.version
+        return self.vocabulary.version
 
     @property
-    def training(self) -> Training | None:
-        """The data of the latest training; None before the first."""
-        return self._training
+    def trained_on(self) -> int | None:
+        """Number of places that the vocabulary was trained on last; None before the first training."""
+        return self._trained_on
 
     def add(self, place: PlaceId, descriptors: Codes) -> None:
         """Store a place with its descriptors (N, 32): Algorithm 1, lines 3-11."""
         if place in self._row_of:
             raise ValueError(f"place {place} is in the index already")
         codes = code_words(descriptors)
-        leaves = self._vocabulary.leaves(codes)
-        self._row_of[place] = self._postings.add(codes, leaves)
+        leaves = self.vocabulary.leaves(codes)
+        self._row_of[place] = self.postings.add(codes, leaves)
         self._ids.append(place)
         i = self._places_seen
         self._places_seen += 1
         if self._is_due(i):
             self._train_on_newest()
-        elif self._training and self._config.strategy is Strategy.INCREMENTAL:
+        elif self._trained_on is not None and self._config.strategy is Strategy.INCREMENTAL:
             self._split(self._overfull(leaves))
 
     def query(
@@ -153,13 +151,13 @@ class PlaceIndex(Generic[PlaceId]):
     def compare(self, descriptors: Codes) -> QueryResult[PlaceId]:
         """Score all stored places against these descriptors (N, 32); empty before the first training."""
         codes = code_words(descriptors)
-        entries, count = self._postings.entries, len(self)
-        if not self._training or not count:
+        entries, count = self.postings.entries, len(self)
+        if self._trained_on is None or not count:
             return QueryResult()
-        if self._postings.row_count > len(self._buffers.scores):
-            self._buffers = empty_buffers(int(GROWTH_FACTOR * self._postings.row_count))
+        if self.postings.row_count > len(self._buffers.scores):
+            self._buffers = empty_buffers(int(GROWTH_FACTOR * self.postings.row_count))
         if self._config.scoring is Scoring.MATCHES:
-            tree, beam = self._vocabulary.tree, self._config.beam
+            tree, beam = self.vocabulary.tree, self._config.beam
             rows, scores = score_matches(entries, tree, self._buffers, count, codes, beam)
         else:
             leaves, weights = self._weigh(codes)
@@ -169,25 +167,25 @@ class PlaceIndex(Generic[PlaceId]):
     def bag(self, descriptors: Codes) -> BagOfWords:
         """Bag of words of descriptors (N, 32) in the present vocabulary, weighted as stored places are."""
         leaves, weights = self._weigh(code_words(descriptors))
-        words = self._vocabulary.words[leaves]
+        words = self.vocabulary.words[leaves]
         order = np.argsort(words)
         return BagOfWords(words[order], weights[order], self.version)
 
     def descriptors(self, place: PlaceId) -> Codes:
         """The descriptors of a stored place, shape (N, 32)."""
-        return frozen(self._postings.codes(self._row_of[place]).view(np.uint8), np.uint8)
+        return frozen(self.postings.codes(self._row_of[place]).view(np.uint8), np.uint8)
 
     def all_descriptors(self) -> Codes:
         """The descriptors of all stored places, in the order in which these were added, shape (M, 32)."""
-        return self._postings.gather(self._rows()).view(np.uint8)
+        return self.postings.gather(self._rows()).view(np.uint8)
 
     def forget(self, place: PlaceId) -> None:
         """Remove a place."""
-        leaves = self._postings.forget(self._row_of.pop(place))
-        if self._training and self._config.strategy is Strategy.INCREMENTAL:
+        leaves = self.postings.forget(self._row_of.pop(place))
+        if self._trained_on is not None and self._config.strategy is Strategy.INCREMENTAL:
             self._merge(leaves)
-        if self._postings.row_count > _ROWS_KEPT * (len(self) + 1):
-            self._describe_again(self._postings.gather(self._rows()))
+        if self.postings.row_count > 2 * (len(self) + 1):  # rows of forgotten places go
+            self._describe_again(self.postings.gather(self._rows()))
 
     def train(self, places: Sequence[Codes]) -> None:
         """Train the tree now on the descriptors of these places, each (N, 32), which need not be stored."""
@@ -196,15 +194,15 @@ class PlaceIndex(Generic[PlaceId]):
     def state(self) -> State:
         """The state without what the stored places hold, from which ``restored`` makes an equal index."""
         rows = self._rows()
-        tree, number_of = self._vocabulary.state()
-        leaves = np.concatenate([np.empty(0, np.int32), *map(self._postings.leaves, rows.tolist())])
+        tree, number_of = self.vocabulary.state()
+        leaves = np.concatenate([np.empty(0, np.int32), *map(self.postings.leaves, rows.tolist())])
         return {
             "size": len(self),
-            "training": asdict(self._training) if self._training else None,
+            "trained_on": self._trained_on,
             "places_seen": self._places_seen,
-            **tree._asdict(),
+            **tree,
             "leaves": number_of[leaves],
-            "norms": self._postings.entries.log_documents[rows] if self._config.scoring is Scoring.WORDS else None,
+            "norms": self.postings.entries.log_documents[rows] if self._config.scoring is Scoring.WORDS else None,
         }
 
     @classmethod
@@ -217,15 +215,14 @@ class PlaceIndex(Generic[PlaceId]):
         shape (N, 32).
         """
         index = cls(config, np.random.default_rng(0))
-        index._training = Training(**state["training"]) if state["training"] else None
+        index._trained_on = state["trained_on"]
         index._places_seen = state["places_seen"]
-        tree = TreeState(*(state[name] for name in TreeState._fields))
-        index._vocabulary = Vocabulary.restored(_shape(config), tree)
-        index._postings = index._no_postings()
+        index.vocabulary = Vocabulary.restored(_shape(config), state)
+        index.postings = index._no_postings()
         counts = np.array([len(each) for each in descriptors], np.int32)
-        index._postings.fill(np.concatenate([_NO_CODES, *map(code_words, descriptors)]), state["leaves"], counts)
+        index.postings.fill(np.concatenate([_NO_CODES, *map(code_words, descriptors)]), state["leaves"], counts)
         if state["norms"] is not None:  # their rounding depends on their history
-            index._postings.entries.log_documents[: len(counts)] = state["norms"]
+            index.postings.entries.log_documents[: len(counts)] = state["norms"]
         index._ids = list(ids)
         index._row_of = {place: row for row, place in enumerate(index._ids)}
         return index
@@ -233,33 +230,33 @@ class PlaceIndex(Generic[PlaceId]):
     def _is_due(self, i: int) -> bool:
         """Algorithm 1, line 4: whether the tree is trained after place i."""
         is_repeated = self._config.strategy is Strategy.REBUILD
-        return i > self._config.train_batch and (is_repeated or self._training is None)
+        return i > self._config.train_batch and (is_repeated or self._trained_on is None)
 
     def _train_on_newest(self) -> None:
         """Algorithm 1, lines 5-9. Its two cases are one window here: D_max(0, i - C + 1) ... D_i."""
         rows = self._rows()[-self._config.capacity :]
-        self._train(self._postings.gather(rows), len(rows))
+        self._train(self.postings.gather(rows), len(rows))
 
     def _train(self, codes: CodeWords, places: int) -> None:
         """Algorithm 1, line 11: train V_t and describe all stored places in its words."""
-        stored = self._postings.gather(self._rows())
-        self._vocabulary.train(codes)
-        self._training = Training(places, len(codes))
+        stored = self.postings.gather(self._rows())
+        self.vocabulary.train(codes)
+        self._trained_on = places
         self._describe_again(stored)
         if self._config.strategy is Strategy.INCREMENTAL:
-            self._split(np.flatnonzero(self._postings.entries.sizes > self._config.leaf_capacity))
+            self._split(np.flatnonzero(self.postings.entries.sizes > self._config.leaf_capacity))
 
     def _describe_again(self, stored: CodeWords) -> None:
         """Rebuild the postings from the codes of all stored places, ``stored`` (M, 4), without unused rows."""
-        counts = self._postings.entries.counts[self._rows()]
-        self._postings = self._no_postings()
-        self._postings.fill(stored, self._vocabulary.leaves(stored), counts)
+        counts = self.postings.entries.counts[self._rows()]
+        self.postings = self._no_postings()
+        self.postings.fill(stored, self.vocabulary.leaves(stored), counts)
         self._ids = list(self._row_of)
         self._row_of = {place: row for row, place in enumerate(self._ids)}
 
     def _no_postings(self) -> Postings:
         """Empty postings for the leaves of the present tree."""
-        return Postings(self._vocabulary.vertex_count, has_norms=self._config.scoring is Scoring.WORDS)
+        return Postings(self.vocabulary.vertex_count, has_norms=self._config.scoring is Scoring.WORDS)
 
     def _rows(self) -> NDArray[np.int64]:
         """Rows of the stored places, ascending, shape (P,)."""
@@ -270,7 +267,7 @@ class PlaceIndex(Generic[PlaceId]):
 
         A word of equal descriptors cannot be split. Doubling the limit avoids a new attempt at every descriptor.
         """
-        capacity, sizes = self._config.leaf_capacity, self._postings.entries.sizes
+        capacity, sizes = self._config.leaf_capacity, self.postings.entries.sizes
         leaves, added = np.unique(entered[sizes[entered] > capacity], return_counts=True)
         after = sizes[leaves]
         limit = capacity * 2.0 ** np.floor(np.log2((after - 1) / capacity))
@@ -281,45 +278,45 @@ class PlaceIndex(Generic[PlaceId]):
         waiting = sorted(overfull.tolist(), key=self._word, reverse=True)
         while waiting:
             leaf = waiting.pop()
-            content = self._postings.content((leaf,))
-            targets = self._vocabulary.split(leaf, content.codes)
+            content = self.postings.content((leaf,))
+            targets = self.vocabulary.split(leaf, content.codes)
             if targets is None:
                 continue
-            self._postings.grow_vertices(self._vocabulary.vertex_count)
-            self._postings.move((leaf,), content, targets)
-            sizes = self._postings.entries.sizes
+            self.postings.grow_vertices(self.vocabulary.vertex_count)
+            self.postings.move((leaf,), content, targets)
+            sizes = self.postings.entries.sizes
             waiting += [child for child in np.unique(targets).tolist() if sizes[child] > self._config.leaf_capacity]
 
     def _merge(self, leaves: NDArray[np.int32]) -> None:
         """Merge nearly empty words with their siblings, level by level."""
         while len(leaves):
-            above = np.unique(self._vocabulary.parents[leaves])
+            above = np.unique(self.vocabulary.parents[leaves])
             nearly_empty = [vertex for vertex in above.tolist() if self._is_nearly_empty(vertex)]
-            for vertex in sorted(nearly_empty, key=lambda v: self._word(self._vocabulary.children(v).start)):
-                children = self._vocabulary.children(vertex)
-                content = self._postings.content(range(children.start, children.stop))
+            for vertex in sorted(nearly_empty, key=lambda v: self._word(self.vocabulary.children(v).start)):
+                children = self.vocabulary.children(vertex)
+                content = self.postings.content(range(children.start, children.stop))
                 targets = np.full(len(content.rows), vertex, np.int32)
-                self._postings.move(range(children.start, children.stop), content, targets)
-                self._vocabulary.merge(vertex)
+                self.postings.move(range(children.start, children.stop), content, targets)
+                self.vocabulary.merge(vertex)
             leaves = np.array(nearly_empty, np.int32)
 
     def _is_nearly_empty(self, vertex: int) -> bool:
         """Whether the children of a vertex are leaves whose descriptors fit into one word."""
         if vertex < 0:
             return False
-        children = self._vocabulary.children(vertex)
-        if self._vocabulary.tree.child_count[children].any():
+        children = self.vocabulary.children(vertex)
+        if self.vocabulary.tree.child_count[children].any():
             return False
-        return bool(self._postings.entries.sizes[children].sum() <= self._config.leaf_capacity // _MERGED_SHARE)
+        return bool(self.postings.entries.sizes[children].sum() <= self._config.leaf_capacity // _MERGED_SHARE)
 
     def _word(self, leaf: int) -> int:
         """Number of a leaf's word; unlike vertex numbers, it does not depend on the layout in memory."""
-        return int(self._vocabulary.words[leaf])
+        return int(self.vocabulary.words[leaf])
 
     def _weigh(self, codes: CodeWords) -> tuple[NDArray[np.int32], FloatArray]:
         """Distinct leaves (K,) and their tf-idf (K,), L1 norm 1. Words of all or of no places have weight 0 and go."""
-        leaves, counts = np.unique(self._vocabulary.leaves(codes), return_counts=True)
-        documents = self._postings.entries.documents[leaves]
+        leaves, counts = np.unique(self.vocabulary.leaves(codes), return_counts=True)
+        documents = self.postings.entries.documents[leaves]
         weights = counts * np.log(max(len(self), 1) / np.maximum(documents, 1))
         telling = weights > 0.0
         values: FloatArray = weights[telling] / max(weights.sum(), TINY)

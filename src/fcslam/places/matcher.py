@@ -20,7 +20,7 @@ from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
 from fcslam.lidar.submap import Submap, agreement
 from fcslam.lidar.verification import NO_PRIOR, VERIFICATION, Verification
 from fcslam.places.index import PlaceIndex, QueryResult
-from fcslam.places.motions import Motion, propose_motions
+from fcslam.places.motions import DISTINCT_M, Motion, propose_motions
 from fcslam.places.similarity import PAPER_SCALE
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, ClosureStatus, FloatArray, KeyscanId, LoopClosure, Place, Reason, ReasonCode, frozen
@@ -50,10 +50,8 @@ class MatchDecision(StrEnum):
 ALIGNED_CANDIDATES = 2
 """Most similar places of other robots in the same map that are compared although the map puts them elsewhere, to find
 evidence against the join."""
-TOLERANCE_M = 1.0
-"""Largest distance at which an image motion confirms a predicted pose, metres."""
 TOLERANCE_RAD = 0.3
-"""Largest angle at which an image motion confirms a predicted pose, radians."""
+"""Largest angle at which an image motion confirms a predicted pose, radians; the distance is ``DISTINCT_M``."""
 
 
 class MatcherConfig(Settings):
@@ -348,7 +346,7 @@ class PlaceMatcher:
     def _candidates(self, result: QueryResult[KeyscanId], is_unaligned: Callable[[KeyscanId], bool]) -> list[KeyscanId]:
         """All places of unaligned robots while they are few, else the most similar ones."""
         eligible = [i for i in self._places if is_unaligned(i)]
-        if len(eligible) <= self._config.small_fleet or self._index.training is None:
+        if len(eligible) <= self._config.small_fleet or self._index.trained_on is None:
             return eligible
         return [found.id for found in result.best(self._config.candidates, is_unaligned)]
 
@@ -385,7 +383,7 @@ class PlaceMatcher:
 
     def _confirms(self, motion: Motion, T_i_j: FloatArray) -> bool:
         off = se2.between(T_i_j, motion.T_a_b)
-        return bool(np.hypot(off[0], off[1]) <= TOLERANCE_M and abs(off[2]) <= TOLERANCE_RAD)
+        return bool(np.hypot(off[0], off[1]) <= DISTINCT_M and abs(off[2]) <= TOLERANCE_RAD)
 
     def _verified(
         self, comparisons: Sequence[_Comparison], place: Place, result: QueryResult[KeyscanId]

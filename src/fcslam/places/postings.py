@@ -28,8 +28,6 @@ OLDER = ROWS + BLOCK
 _INDICES = OLDER + 2
 """Offset in a block's ``numbers``: index of each entry among the descriptors of its place."""
 _BLOCK_WORDS = (_INDICES + BLOCK) // 2
-_LINE = 16
-"""32-bit numbers in a cache line."""
 
 
 class Entries(NamedTuple):
@@ -216,7 +214,7 @@ def newest_block(entries: Entries, leaf: int) -> tuple[int, int]:
 @njit
 def prefetch_block(entries: Entries, block: int) -> None:
     """Prefetch the part of a block that a query reads; blocks are not aligned to cache lines."""
-    for number in range(0, OLDER, _LINE):
+    for number in range(0, OLDER, 16):  # numbers in a cache line
         prefetch(entries.numbers, block, number)
     prefetch(entries.numbers, block, OLDER)
 

@@ -7,9 +7,6 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-_READ, _KEEP, _DATA = 0, 3, 1
-"""Arguments of llvm.prefetch: for reading, high temporal locality, data cache."""
-
 
 @intrinsic
 def prefetch(_context: Any, array: Any, row: Any, column: Any) -> Any:
@@ -29,7 +26,7 @@ def prefetch(_context: Any, array: Any, row: Any, column: Any) -> Any:
         announce = builder.module.declare_intrinsic(
             "llvm.prefetch", [cgutils.voidptr_t], ir.FunctionType(ir.VoidType(), parameters)
         )
-        builder.call(announce, [address, number(_READ), number(_KEEP), number(_DATA)])
+        builder.call(announce, [address, number(0), number(3), number(1)])  # to read, keep, data cache
         return context.get_dummy_value()
 
     return types.none(array, row, column), generate

@@ -4,9 +4,8 @@ A word is a leaf; finding it takes branching x depth comparisons. A split or mer
 so every other descriptor keeps its word. A word's number is never used again.
 """
 
-from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from fcslam.config import Settings
 from fcslam.features.codes import CodeWords
 from fcslam.places.kmeans_tree import Tree, TreeShape, bare_root, find_leaves, grow_tree, k_means
 from fcslam.places.postings import GROWTH_FACTOR, grown_rows
+from fcslam.storage.state_file import State
 
 
 class Strategy(StrEnum):
@@ -32,12 +32,6 @@ class Scoring(StrEnum):
     MATCHES = "matches"
 
 
-SMALLEST_SPLIT = 20
-"""Smallest cluster that training splits further, descriptors."""
-ITERATIONS = 8
-"""Most rounds of k-means for one cluster."""
-
-
 class TreeConfig(Settings):
     """Shape of the k-means tree when it is trained."""
 
@@ -49,7 +43,7 @@ class TreeConfig(Settings):
     @property
     def shape(self) -> TreeShape:
         """The same limits for compiled code."""
-        return TreeShape(self.branching, self.depth, SMALLEST_SPLIT, ITERATIONS)
+        return TreeShape(self.branching, self.depth, smallest_split=20, iterations=8)
 
 
 class VocabularyConfig(Settings):
@@ -78,28 +72,6 @@ class VocabularyConfig(Settings):
     beam: int = Field(
         default=4, ge=1, le=64, description="words that are searched for each descriptor of a query, scoring matches"
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Training:
-    """The data that a vocabulary was trained on."""
-
-    places: int
-    descriptors: int
-
-
-class TreeState(NamedTuple):
-    """A tree in storage order: vertices are numbered level by level, so the child counts determine all children."""
-
-    seed: int
-    version: int
-    words_given: int
-    centres: CodeWords
-    """Shape (V, 4)."""
-    child_count: NDArray[np.int32]
-    """Shape (V,)."""
-    words: NDArray[np.int64]
-    """Shape (V,)."""
 
 
 class Vocabulary:
@@ -136,8 +108,11 @@ class Vocabulary:
         self.parents = _parents(self.tree.child_count)
         self._free.clear()
 
-    def state(self) -> tuple[TreeState, NDArray[np.int32]]:
-        """The tree in storage order, and the number there of every present vertex (V,), -1 for unused ones."""
+    def state(self) -> tuple[State, NDArray[np.int32]]:
+        """The tree in storage order, and the number there of every present vertex (V,), -1 for unused ones.
+
+        Vertices are numbered level by level, so the child counts determine all children.
+        """
         order = level = np.zeros(1, np.int64)
         while len(level):
             counts = self.tree.child_count[level]
@@ -146,19 +121,25 @@ class Vocabulary:
             order = np.concatenate([order, level])
         number_of = np.full(self.vertex_count, -1, np.int32)
         number_of[order] = np.arange(len(order))
-        centres, child_count = self.tree.centres[order], self.tree.child_count[order]
-        tree = TreeState(self._seed, self.version, self._words_given, centres, child_count, self.words[order])
+        tree = {
+            "seed": self._seed,
+            "version": self.version,
+            "words_given": self._words_given,
+            "centres": self.tree.centres[order],
+            "child_count": self.tree.child_count[order],
+            "words": self.words[order],
+        }
         return tree, number_of
 
     @classmethod
-    def restored(cls, shape: TreeShape, state: TreeState) -> Self:
+    def restored(cls, shape: TreeShape, state: State) -> Self:
         """Restore a vocabulary from its state."""
-        vocabulary = cls(shape, state.seed)
-        counts = state.child_count
+        vocabulary = cls(shape, state["seed"])
+        counts = state["child_count"]
         first_child = np.where(counts > 0, 1 + np.cumsum(counts) - counts, 0).astype(np.int32)
-        vocabulary.tree = Tree(state.centres, np.column_stack((first_child, counts)))
-        vocabulary.words = state.words
-        vocabulary.version, vocabulary._words_given = state.version, state.words_given
+        vocabulary.tree = Tree(state["centres"], np.column_stack((first_child, counts)))
+        vocabulary.words = state["words"]
+        vocabulary.version, vocabulary._words_given = state["version"], state["words_given"]
         vocabulary.vertex_count = len(counts)
         vocabulary.parents = _parents(counts)
         return vocabulary

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fcslam.config import Settings
-from fcslam.features.classical import OrbConfig, make_detector
+from fcslam.features.classical import make_detector
 from fcslam.features.detector import FeatureDetector, GreyImage, MissingExtraError, OnnxConfig, decode_grey
 from fcslam.features.detector_file import open_detector_file
 from fcslam.features.detector_kinds import DetectorKind
@@ -74,7 +74,7 @@ class ViewExtractor:
         return None if self._detector is None else self._detector.version
 
     def _make_detector(self) -> FeatureDetector:
-        return make_detector(self._config.detector, OrbConfig(), OnnxConfig(weights=self._config.weights))
+        return make_detector(self._config.detector, OnnxConfig(weights=self._config.weights))
 
     def describe(
         self, image: CameraImage, scan: LaserScan, pose: ScanPose, scans: Sequence[LaserScan]
