@@ -28,7 +28,9 @@ class Cloud(FleetHost):
         verify_pairs: VerifyPairs = verify_here,
         grid: OccupancyConfig = _GRID,
     ) -> None:
-        super().__init__(CloudConfig(seed=seed, fleet=config, map=grid), self._packet, verify_pairs)
+        super().__init__(
+            CloudConfig(seed=seed, fleet=config, map=grid), lambda number: self._packets[number], verify_pairs
+        )
         self._times: dict[PacketNumber, float] = {}
         """Time of each packet."""
         self._packets: dict[PacketNumber, Packet] = {}
@@ -70,9 +72,6 @@ class Cloud(FleetHost):
     def finalize(self) -> FleetResult:
         """The result of all packets so far; it depends on their set alone."""
         return self.conclude((time, number) for number, time in self._times.items())
-
-    def _packet(self, number: PacketNumber) -> Packet:
-        return self._packets[number]
 
     def _replies(self, packet: Packet, session: str) -> list[Packet]:
         robot, epoch = packet.robot, packet.epoch

@@ -106,10 +106,6 @@ class ClosureDecisions(Kept):
         accepted = [entry.is_between for entry in self.closures if entry.closure.status is ClosureStatus.ACCEPTED]
         return {"within robots": accepted.count(False), "between robots": accepted.count(True)}
 
-    def start_map(self, session: str) -> None:
-        """A new session begins in a map of its own."""
-        self.maps.append([session])
-
     def add_local(self, closure: Constraint, tag: Tag | None = None) -> None:
         """Accept a closure within a robot's own map, which it found or a ``tag`` gives, unless it is vetoed."""
         i, j = KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j)
@@ -229,11 +225,8 @@ class ClosureDecisions(Kept):
             and not any(is_removed(session, self.changes) for session in (change.robot_i, change.robot_j))
             and self._sessions.floor(change.robot_i) == self._sessions.floor(change.robot_j)
             and len(set(self._ends(change))) == 2
-            and (final or all(self._has_passed(session, stamp) for session, stamp in stamps_of(change)))
+            and (final or all(self._sessions.stamps(session)[-1] >= stamp for session, stamp in stamps_of(change)))
         ]
-
-    def _has_passed(self, session: str, stamp: float) -> bool:
-        return bool(self._sessions.stamps(session)[-1] >= stamp)
 
     def _ends(self, made: ManualClosure) -> tuple[KeyscanId, KeyscanId]:
         return self._sessions.nearest(made.robot_i, made.stamp_i), self._sessions.nearest(made.robot_j, made.stamp_j)

@@ -292,7 +292,7 @@ class Fleet:
         self._sessions.add_keyscan(keyscan, sequence)
         if keyscan.id.number == 0:
             self._graph.start(keyscan.id.robot)
-            self._decisions.start_map(keyscan.id.robot)
+            self._decisions.maps.append([keyscan.id.robot])
 
     def _add_sighting(self, sighting: TagSighting) -> None:
         session = sighting.id.robot

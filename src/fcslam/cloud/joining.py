@@ -90,14 +90,12 @@ def reevaluate(
             entry.edge = graph.close(i, j, T_i_j, information)
             graph.count(entry.edge, holds=False)
     robots = list(graph.robots())
-
-    def examine_pair(a: int, b: int, path_a: Trajectory, path_b: Trajectory, members: Closures) -> MapFit | None:
-        return examine((robots[a], robots[b]), path_a, path_b, members)
-
-    def compare_pair(a: int, b: int, poses_a: FloatArray, poses_b: FloatArray) -> MapFit:
-        return compare((robots[a], robots[b]), poses_a, poses_b)
-
-    solution = solve_jointly(_evidence(graph, entries), settings, examine=examine_pair, compare=compare_pair)
+    solution = solve_jointly(
+        _evidence(graph, entries),
+        settings,
+        examine=lambda a, b, *paths_and_members: examine((robots[a], robots[b]), *paths_and_members),
+        compare=lambda a, b, *poses: compare((robots[a], robots[b]), *poses),
+    )
     graph.take(solution.poses)
     shortfalls = {(link.a, link.b): link.decision.shortfall for link in solution.links}
     apart = {pair: reason.under(CONSISTENCY) for pair, reason in shortfalls.items() if reason} | dict(solution.apart)

@@ -26,9 +26,11 @@ class PacketLog:
     _waiting: dict[str, set[int]] = field(default_factory=dict)
     """By session the numbers that arrived and did not take effect."""
     _refused: set[PacketNumber] = field(default_factory=set)
-    _released: int = 0
+    released: int = 0
+    """How many packets took effect or were refused, with all those before them in their sessions."""
     _newest: tuple[float, str, int] = (-math.inf, "", 0)
-    _is_canonical: bool = True
+    is_canonical: bool = True
+    """Whether the packets arrived in the order of their times, as ``canonical`` would give them."""
 
     def __contains__(self, number: PacketNumber) -> bool:
         """Whether this packet arrived before or was refused."""
@@ -41,22 +43,12 @@ class PacketLog:
         """Sessions with at least one packet, in the order in which they were first heard of."""
         return tuple(self._waiting)
 
-    @property
-    def released(self) -> int:
-        """How many packets took effect or were refused, with all those before them in their sessions."""
-        return self._released
-
-    @property
-    def is_canonical(self) -> bool:
-        """Whether the packets arrived in the order of their times, as ``canonical`` would give them."""
-        return self._is_canonical
-
     def add(self, number: PacketNumber, time_s: float) -> None:
         """Note that a packet arrived; its envelope says when its robot sent it."""
         if number in self:
             return
         order = time_s, *number
-        self._is_canonical &= order > self._newest
+        self.is_canonical &= order > self._newest
         self._newest = max(order, self._newest)
         self._waiting.setdefault(number.session, set()).add(number.sequence)
 
@@ -76,7 +68,7 @@ class PacketLog:
                 yield number
             waiting.discard(sequence)
             self._next[session] = sequence + 1
-            self._released += 1
+            self.released += 1
 
     def would_wait(self, numbers: Iterable[PacketNumber]) -> list[PacketNumber]:
         """Those of some packets that would have to wait for an earlier one if all of them arrived now."""

@@ -1,7 +1,7 @@
 """Place recognition of the fleet: which stored places may a new one show again, and which are kept."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from operator import attrgetter, itemgetter
 from typing import NamedTuple
 
@@ -87,15 +87,17 @@ class PlaceRecognition:
         """Number of the keyscan and of the arrival of each stored place, shape (N, 2), by vocabulary and session."""
         self._arrivals = 0
 
-    def match(self, place: Place, mates: Collection[str]) -> list[PlaceMatch]:
+    def match(self, place: Place, map_sessions: Collection[str]) -> list[PlaceMatch]:
         """Compare a new place with the stored ones and store it (Algorithm 1).
 
-        ``mates`` are the sessions that share its map, its own included. The keyscans of the place's submap are held.
+        ``map_sessions`` share its map, its own session included. The keyscans of the place's submap are held.
         """
         key = self._key(place)
         matcher = self._matcher(key)
-        by_start = list(self._by_start(place, mates))
-        matches = matcher.match(place, self._predicted(place, mates), _outside(mates))
+        by_start = list(self._by_start(place, map_sessions))
+        matches = matcher.match(
+            place, self._predicted(place, map_sessions), lambda other: other.robot not in map_sessions
+        )
         self._enter(key, place.id)
         verified = {match.i for match in matches if match.M}
         at_start = {match.i: match for match in by_start if match.i not in verified}
@@ -114,10 +116,10 @@ class PlaceRecognition:
                 new = [i for i in others if not self._closures.has(i, place, key[0])]
                 yield place.robot, matcher.match_again(place, new)
 
-    def thin(self, place: Place, mates: Collection[str]) -> None:
+    def thin(self, place: Place, map_sessions: Collection[str]) -> None:
         """Forget the oldest places of the robot in one map where it has very many, and those of its old sessions."""
         key, robot, settings = self._key(place), robot_of(place.id.robot), self._config.matcher
-        matcher, sessions = self._matchers[key], [session for session in mates if robot_of(session) == robot]
+        matcher, sessions = self._matchers[key], [session for session in map_sessions if robot_of(session) == robot]
         if len(matcher) <= settings.most_nearby and len(sessions) <= settings.most_sessions_nearby:
             return
         stored = [self._places.get((key, session), _NO_PLACES) for session in sessions]
@@ -183,11 +185,11 @@ class PlaceRecognition:
         self.submaps.drop(place)
         self._sessions.release(place)
 
-    def _predicted(self, place: Place, mates: Collection[str]) -> dict[KeyscanId, FloatArray]:
+    def _predicted(self, place: Place, map_sessions: Collection[str]) -> dict[KeyscanId, FloatArray]:
         """T_i_j (3,) to the nearest places of other sessions in the map: one for each visit, few for each group."""
         pose, key = self._graph.pose(place.id), self._key(place)
         visits: dict[str, list[Visit]] = {}
-        for session in mates:
+        for session in map_sessions:
             numbers = self._places.get((key, session), _NO_PLACES)[:, 0]
             if session == place.id.robot or not len(numbers):
                 continue
@@ -198,7 +200,7 @@ class PlaceRecognition:
         chosen = worth_comparing(visits, self._closures_near(visits), NEAR_VISITS)
         return {visit.nearest: se2.between(self._graph.pose(visit.nearest), pose) for visit in chosen}
 
-    def _by_start(self, place: Place, mates: Collection[str]) -> Iterator[PlaceMatch]:
+    def _by_start(self, place: Place, map_sessions: Collection[str]) -> Iterator[PlaceMatch]:
         """Matches with places of other maps that agree with the known starts.
 
         Starts so far apart that their headings leave open which of two separate places it is tell nothing.
@@ -211,7 +213,7 @@ class PlaceRecognition:
             numbers = self._places.get((key, session), _NO_PLACES)[:, 0]
             T_starts = se2.between(starts[session], starts[place.id.robot])
             within_m = START_SIGMAS * float(np.sqrt(2.0) * sigma_m + sigma_rad * np.hypot(*T_starts[:2]))
-            if session in mates or not len(numbers) or within_m > self._config.consistency.separation_m:
+            if session in map_sessions or not len(numbers) or within_m > self._config.consistency.separation_m:
                 continue
             T_start_i = dict(zip(numbers.tolist(), self._from_start(session, numbers), strict=True))
             T_start_j = se2.compose(T_starts, T_start_place)
@@ -239,11 +241,6 @@ class PlaceRecognition:
         return Counter(
             frozenset((robot_of(entry.closure.i.robot), robot_of(entry.closure.j.robot))) for entry in entries
         )
-
-
-def _outside(mates: Collection[str]) -> Callable[[KeyscanId], bool]:
-    known = frozenset(mates)
-    return lambda place: place.robot not in known
 
 
 def visits_near(

@@ -5,7 +5,6 @@ The same replies leave the service (``service.intake``) and the cloud within one
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import count
 
 import numpy as np
 
@@ -48,22 +47,17 @@ def replies(
     ``known_correction`` is the version of the newest correction that the robot has, -1: none. ``announced`` are the
     detectors that robots are to use.
     """
-    number = count()
-    packets = [
-        _packet(robot, epoch, number, Acknowledgement(robot, epoch, expected - 1))
-        for epoch, expected in state.next_sequences.items()
-        if expected > 0
-    ]
     if not state.next_sequences:
-        return packets
+        return []
+    expected = state.next_sequences.items()
+    bodies: list[tuple[int, float, Body]] = [(k, 0.0, Acknowledgement(robot, k, n - 1)) for k, n in expected if n > 0]
     if (news := state.correction) and news.correction.version > known_correction:
-        packets.append(_packet(robot, news.epoch, number, news.correction, news.time))
-    epoch = max(state.next_sequences)
+        bodies.append((news.epoch, news.time, news.correction))
     versions = state.detector_versions or {}
     for channel, file in announced.items():
         if versions.get(channel, file.version) != file.version:  # a robot without the channel needs no detector
-            packets.append(_packet(robot, epoch, number, DetectorUpdate(robot, file)))
-    return packets
+            bodies.append((max(state.next_sequences), 0.0, DetectorUpdate(robot, file)))
+    return [Packet(robot, epoch, number, time_s, body) for number, (epoch, time_s, body) in enumerate(bodies)]
 
 
 def is_news(old: Correction | None, new: Correction) -> bool:
@@ -74,7 +68,3 @@ def is_news(old: Correction | None, new: Correction) -> bool:
     turned = min(theta, 2.0 * np.pi - theta)
     changed = abs(old.quality - new.quality) >= NEWS_QUALITY or (old.quality == 0.0) != (new.quality == 0.0)
     return bool(max(x, y) >= NEWS_M or turned >= NEWS_RAD or changed)
-
-
-def _packet(robot: str, epoch: int, number: "count[int]", body: Body, time_s: float = 0.0) -> Packet:
-    return Packet(robot, epoch, next(number), time_s, body)

@@ -79,7 +79,7 @@ class SeenTags(Kept):
             raise PacketError(f"{session}: keyscan {number} saw more than {MOST_TAGS} tags")
         newest: dict[str, str] = {}
         for name in reversed(seen):
-            if name != session and self._share_floor(name, session):
+            if name != session and self._sessions.floor(name) == self._sessions.floor(session):
                 newest.setdefault(robot_of(name), name)
         chosen = [(name, seen[name].values()) for name in islice(newest.values(), MOST_SENDERS)]
         back_m = self._graph.travel_since(session)
@@ -113,9 +113,6 @@ class SeenTags(Kept):
         every = [one for sessions in self._seen.values() for own in sessions.values() for one in own.values()]
         self._tags = Counter(one.id for one in every)
         self._ends = Counter(frozenset((one.robot, name)) for pairs in self._paired.values() for one, name in pairs)
-
-    def _share_floor(self, a: str, b: str) -> bool:
-        return self._sessions.floor(a) == self._sessions.floor(b)
 
 
 def _match(i: TagSighting, j: TagSighting) -> PlaceMatch:

@@ -81,8 +81,7 @@ class RobotPose:
         map is added. The error of the map is not part of it. NaN where ``T_map_base`` is.
         """
         information = motion_information(self._motion, self._tracked, self._odometry)
-        cos, sin = np.cos(self.T_map_base[2]), np.sin(self.T_map_base[2])
-        turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
+        turn = se2.adjoint((0.0, 0.0, self.T_map_base[2]))
         return frozen(self._before + turn @ np.linalg.inv(information) @ turn.T)
 
     @property

@@ -455,10 +455,8 @@ class Robot(LiveTracker):
         return None if pose is None or pose.map_index is None else (pose.map_index, pose.T_map_base)
 
     def _correct(self, session: int, correction: Correction) -> None:
-        self._map_poses.correct(session, correction, self._is_server_away())
-
-    def _is_server_away(self) -> bool:
-        return self._uplink is None or self._uplink.trouble is not None
+        is_server_away = self._uplink is None or self._uplink.trouble is not None
+        self._map_poses.correct(session, correction, is_server_away)
 
     def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray | None) -> RobotPose:
         localizer = self._map_poses.localizer(self._session)

@@ -176,7 +176,7 @@ class MapLocalizer:
         predicted = se2.compose(T_map_base, se2.between(before.T_local_base, keyscan.T_local_base))
         dx, dy = predicted[:2] - T_map_base[:2]
         lever = np.array(((1.0, 0.0, -dy), (0.0, 1.0, dx), (0.0, 0.0, 1.0)))
-        turn = _turn(predicted[2])
+        turn = se2.adjoint((0.0, 0.0, predicted[2]))
         assert keyscan.odometry is not None  # only the first keyscan of a session has no motion
         motion = turn @ np.linalg.inv(keyscan.odometry.information) @ turn.T
         self._covariance = lever @ self._covariance @ lever.T + motion
@@ -308,8 +308,3 @@ class MapLocalizer:
         T_map_odom = se2.compose(self._T_map_base, se2.inverse(keyscan.T_local_base))
         quality = min(self._quality, self._newest_share)
         self.estimate = MapEstimate(frozen(T_map_odom), frozen(self._covariance), quality)
-
-
-def _turn(theta: float) -> FloatArray:
-    cos, sin = np.cos(theta), np.sin(theta)
-    return np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))

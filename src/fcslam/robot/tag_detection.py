@@ -152,8 +152,7 @@ def tag_in_base(
     covariance += np.diag((sigma_m**2, sigma_m**2, HEADING_SIGMA_RAD**2))
     if not (covariance.diagonal() < LARGEST_SIGMAS**2).all():  # so that NaN fails, too
         return None
-    cos, sin = np.cos(T_base_tag[2]), np.sin(T_base_tag[2])
-    turn = np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
+    turn = se2.adjoint((0.0, 0.0, T_base_tag[2]))
     information = turn.T @ np.linalg.inv(covariance) @ turn
     return T_base_tag, 0.5 * (information + information.T)
 
