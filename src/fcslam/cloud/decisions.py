@@ -175,19 +175,17 @@ class ClosureDecisions(Kept):
     def _mark(self, entry: ClosureEntry) -> bool:
         """Note whether users exclude or pin the closure; returns whether that is new."""
         before = entry.vetoed, entry.pinned
-        entry.vetoed, entry.pinned = self._is_vetoed(entry), self._is_pinned(entry)
-        return before != (entry.vetoed, entry.pinned)
-
-    def _is_vetoed(self, entry: ClosureEntry) -> bool:
-        if entry.made_by_hand is not None and entry.made_by_hand not in self.changes:
-            return True
         i, j = ((end.robot, self._sessions.stamp(end)) for end in (entry.closure.i, entry.closure.j))
-        return (
-            is_removed(i[0], self.changes)
-            or is_removed(j[0], self.changes)
+        is_undone = entry.made_by_hand is not None and entry.made_by_hand not in self.changes
+        entry.vetoed = (
+            is_undone
+            or any(is_removed(session, self.changes) for session, _ in (i, j))
             or any(change.forbids(*i, *j) for change in self.changes if isinstance(change, Veto))
             or self._is_cut(entry)
         )
+        pins = [change for change in self.changes if isinstance(change, Pin)]
+        entry.pinned = entry.made_by_hand is not None or any(pin.confirms(*i, *j) for pin in pins)
+        return before != (entry.vetoed, entry.pinned)
 
     def _is_cut(self, entry: ClosureEntry) -> bool:
         """Whether users cut a scan behind the closure: of the submaps that were compared, or else of its two ends."""
@@ -201,13 +199,6 @@ class ClosureDecisions(Kept):
             if any(is_cut(end.robot, stamp, cuts) for stamp in stamps):
                 return True
         return False
-
-    def _is_pinned(self, entry: ClosureEntry) -> bool:
-        i, j = entry.closure.i, entry.closure.j
-        pins = [change for change in self.changes if isinstance(change, Pin)]
-        return entry.made_by_hand is not None or any(
-            pin.confirms(i.robot, self._sessions.stamp(i), j.robot, self._sessions.stamp(j)) for pin in pins
-        )
 
     def _missing(self, final: bool) -> list[ManualClosure]:
         """Closures by hand, in force, that are not in the log yet and whose keyscans are there.

@@ -191,10 +191,6 @@ class Robot(LiveTracker):
             stamp: seconds, as in ``add_scan``.
             odometry: as in ``add_scan``, at the stamp of the image. None: the robot is taken to be where the last scan
                 was made.
-
-        Raises:
-            InputError: the robot has no camera, the image does not fit it, the clock went back by more than 2 s, a
-                number cannot be used, or the robot is finished. The image is ignored.
         """
         if self._camera is None:
             raise InputError(f"{self.name}: the robot has no camera; give camera=fcslam.CameraModel(...)")
@@ -206,8 +202,7 @@ class Robot(LiveTracker):
     def change_floor(self, floor: str) -> None:
         """Go on in a new session on another floor: after a ride in a lift, before the first scan there.
 
-        Args:
-            floor: as for the robot itself.
+        ``floor`` is as for the robot itself.
         """
         _check_floor(floor)
         with self._lock:
@@ -238,9 +233,6 @@ class Robot(LiveTracker):
 
         Without a server, and before it has drawn the map that the robot is in, it is ``own_map``. While the server is
         away, it is the newest joint map with all that the robot has seen since.
-
-        Returns:
-            The occupancy of each cell, shape (H, W), the side of a cell and the lower left corner in ``map``.
         """
         joint = self.joint_map()
         return self.own_map() if joint is None else joint
@@ -259,9 +251,6 @@ class Robot(LiveTracker):
 
         It takes tens of milliseconds to seconds, in the worker; other threads may add scans meanwhile. With a server it
         is in the frame of the fleet's map.
-
-        Returns:
-            As ``map``.
         """
         own = self._require_own_map()
         self._catch_up()

@@ -266,38 +266,19 @@ class _Session:
         return [hello, *(self._camera_place(view) for view in fresh)]
 
     def _lidar_place(self, submap: FinishedSubmap) -> Place:
-        features = self._own_places.features(submap.anchor)
-        return Place(
-            KeyscanId(self._robot, submap.anchor),
-            Channel.LIDAR,
-            DETECTOR_VERSION,
-            submap.first,
-            submap.last,
-            features.keypoints_m,
-            features.descriptors,
-        )
+        keyscan, features = KeyscanId(self._robot, submap.anchor), self._own_places.features(submap.anchor)
+        described = features.keypoints_m, features.descriptors
+        return Place(keyscan, Channel.LIDAR, DETECTOR_VERSION, submap.first, submap.last, *described)
 
     def _camera_place(self, view: CameraView) -> Place:
-        first, last = self._submaps[view.keyscan]
         self._described.add((view.keyscan, view.detector_version))
-        return Place(
-            KeyscanId(self._robot, view.keyscan),
-            Channel.CAMERA,
-            view.detector_version,
-            first,
-            last,
-            view.keypoints,
-            view.descriptors,
-        )
-
-    @property
-    def detector_versions(self) -> dict[Channel, str]:
-        """Detector versions of the channels in use."""
-        versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_extractor.detector_version}
-        return {channel: found for channel in self._config.channels if (found := versions[channel]) is not None}
+        keyscan, span = KeyscanId(self._robot, view.keyscan), self._submaps[view.keyscan]
+        return Place(keyscan, Channel.CAMERA, view.detector_version, *span, view.keypoints, view.descriptors)
 
     def _hello(self) -> Hello:
-        return Hello(self._robot, self.epoch, self._lasers, self.detector_versions)
+        known = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_extractor.detector_version}
+        versions = {channel: version for channel in self._config.channels if (version := known[channel]) is not None}
+        return Hello(self._robot, self.epoch, self._lasers, versions)
 
 
 def essential(input: NewKeyscan) -> list[Body]:

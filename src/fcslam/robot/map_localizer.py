@@ -18,7 +18,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.frontend import POINT_INFORMATION_SHARE, MappedKeyscan
 from fcslam.lidar.lost import LEAST_OVERLAP, LEAST_RATIO, LEAST_RIVAL_M, LOST_EXPLAINED
 from fcslam.lidar.matching import match_scan
-from fcslam.lidar.submap import Agreement, Submap, agreement, build_submap
+from fcslam.lidar.submap import Submap, agreement, build_submap
 from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, SUPPORTED
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd
@@ -185,7 +185,7 @@ class MapLocalizer:
     def _explained(self, reach_m: float, otherwise: float) -> float:
         """Share of the walls of the last metres that lie on walls of the map; ``otherwise``, if it knows too little."""
         assert self._T_map_base is not None
-        found = self._agreement(self._T_map_base, reach_m)
+        found = agreement(self._submap(reach_m), self._map, self._T_map_base)
         return found.explained if found.overlap >= LEAST_OVERLAP else otherwise
 
     def _match(self, T_map_guess: FloatArray, keyscan: MappedKeyscan) -> FloatArray:
@@ -201,7 +201,7 @@ class MapLocalizer:
     def _check(self, keyscan: MappedKeyscan) -> None:
         assert self._T_map_base is not None
         self._checked_m = keyscan.travel_m
-        found = self._agreement(self._T_map_base, CHECKED_M)
+        found = agreement(self._submap(CHECKED_M), self._map, self._T_map_base)
         if found.overlap >= LEAST_OVERLAP:
             self._seen_m, self._quality = keyscan.travel_m, found.explained
             if found.explained < LOST_EXPLAINED and found.violation > LOST_IN_FREE_SPACE:
@@ -224,9 +224,6 @@ class MapLocalizer:
         if ratio >= LEAST_RATIO:
             self._lose()
             self._vote(rival.T_a_b, ratio, submap, keyscan)
-
-    def _agreement(self, T_map_base: FloatArray, reach_m: float) -> Agreement:
-        return agreement(self._submap(reach_m), self._map, T_map_base)
 
     def _submap(self, reach_m: float) -> Submap:
         newest = self._recent[-1]
@@ -274,10 +271,11 @@ class MapLocalizer:
         evidence = len(self._votes) + min(vote.ratio for vote in self._votes) - 1.0
         if evidence >= LEAST_EVIDENCE and any(vote.is_clear for vote in self._votes):
             self._fix(T_map_base, keyscan)
-        self._begin_stretch(keyscan.travel_m)
+        self._begin_stretch()
 
-    def _begin_stretch(self, travel_m: float) -> None:
-        self._searched_m, self._next_search_m = travel_m, travel_m + FIRST_SEARCH_M
+    def _begin_stretch(self) -> None:
+        self._searched_m = self._recent[-1].travel_m
+        self._next_search_m = self._searched_m + FIRST_SEARCH_M
 
     def _agree(self, one: "_Vote", other: "_Vote", keyscan: MappedKeyscan) -> bool:
         """Whether two alignments put the newest keyscan at one pose of the map."""
@@ -291,7 +289,7 @@ class MapLocalizer:
         self._T_map_base = T_map_base
         self._covariance = np.diag((FIRST_SIGMA_M**2, FIRST_SIGMA_M**2, FIRST_SIGMA_RAD**2))
         self._checked_m = self._seen_m = keyscan.travel_m
-        self._quality = self._agreement(T_map_base, CHECKED_M).explained
+        self._quality = agreement(self._submap(CHECKED_M), self._map, T_map_base).explained
         self._newest_share = self._explained(0.0, self._quality)
 
     def _lose(self) -> None:
@@ -299,7 +297,7 @@ class MapLocalizer:
         self._T_map_base, self._quality = None, 0.0
         self._votes = []
         if self._recent:
-            self._begin_stretch(self._recent[-1].travel_m)
+            self._begin_stretch()
 
     def _publish(self, keyscan: MappedKeyscan) -> None:
         if self._T_map_base is None:

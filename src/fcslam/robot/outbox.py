@@ -98,7 +98,11 @@ class Outbox:
             f"WHERE {_IS_WAITING} ORDER BY epoch, sequence"
         )
         for epoch, session, ordinal, sequence, digest, data in self._rows(question):
-            if not _is_whole(data, session, ordinal, digest):
+            try:
+                is_whole = _digest(readdress(data, session, ordinal)) == digest
+            except PacketError:
+                is_whole = False
+            if not is_whole:
                 raise InputError(
                     f"{self._path}: packet {sequence} of epoch {epoch} is damaged, and later packets depend on "
                     "it; give another --state"
@@ -164,15 +168,16 @@ class Outbox:
                 if self._is_known(connection, epoch, packet.sequence, digest):
                     continue
                 crowded = self.waiting.bytes >= PLACES_SHARE * self._limit_bytes
+                number = sent = None
                 if crowded and isinstance(packet.body, Place):
-                    _insert(connection, epoch, packet.sequence, digest, None, None)
                     dropped += 1
-                    continue
-                numbers = "SELECT coalesce(max(sequence) + 1, 0) FROM packets WHERE epoch = ?"
-                (number,) = _one(connection, numbers, epoch)
-                sent = readdress(data, epoch, number)
-                _insert(connection, epoch, packet.sequence, digest, number, sent)
-                self.waiting = WaitingPackets(self.waiting.packets + 1, self.waiting.bytes + len(sent))
+                else:
+                    numbers = "SELECT coalesce(max(sequence) + 1, 0) FROM packets WHERE epoch = ?"
+                    (number,) = _one(connection, numbers, epoch)
+                    sent = readdress(data, epoch, number)
+                    self.waiting = WaitingPackets(self.waiting.packets + 1, self.waiting.bytes + len(sent))
+                row = epoch, packet.sequence, digest, number, sent
+                connection.execute("INSERT INTO packets VALUES (?, ?, ?, ?, ?)", row)
         return dropped
 
     def complete_sessions(self) -> list[bytes]:
@@ -344,19 +349,6 @@ class Outbox:
 
 def _digest(data: bytes) -> bytes:
     return hashlib.blake2b(data, digest_size=8).digest()
-
-
-def _is_whole(data: bytes, session: int, ordinal: int, digest: bytes) -> bool:
-    try:
-        return _digest(readdress(data, session, ordinal)) == digest
-    except PacketError:
-        return False
-
-
-def _insert(
-    connection: sqlite3.Connection, epoch: int, ordinal: int, digest: bytes, sequence: int | None, data: bytes | None
-) -> None:
-    connection.execute("INSERT INTO packets VALUES (?, ?, ?, ?, ?)", (epoch, ordinal, digest, sequence, data))
 
 
 def _count(connection: sqlite3.Connection, which: str) -> tuple[int, int]:
