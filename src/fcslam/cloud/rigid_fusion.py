@@ -55,21 +55,22 @@ def fuse_rigidly(closures: Iterable[ClosureEntry], T_local_base: Mapping[str, Fl
     are accepted, the others stay verified; closures within robots keep their status.
     """
     order, entries = list(T_local_base), list(closures)
-    matches = [_match(entry, T_local_base, order) for entry in entries if _is_valid(entry)]
-    links = _links(matches)
+    between = [entry for entry in entries if entry.is_between and not entry.vetoed]
+    valid = [entry for entry in between if entry.closure.status is not ClosureStatus.CANDIDATE]
+    links = _links([_match(entry, T_local_base, order) for entry in valid])
     maps, frames = [[robot] for robot in order], {robot: np.zeros(3) for robot in order}
     used: dict[ClosureEntry, Reason] = {}
     for robots, members in links.items():
-        if _join(robots, _relation(members), maps, frames):
+        try:
+            T_a_b = two_point_alignment([match.xy_a for match in members], [match.xy_b for match in members])
+        except ValueError:  # a robot claims to be so far away that its two points are one to a computer
+            continue
+        if np.isfinite(T_a_b).all() and _join(robots, T_a_b, maps, frames):
             used |= {match.entry: Reason(ReasonCode.MATCHED_POINT, len(members)) for match in members}
     T_map_base: dict[str, FloatArray] = {
         robot: frozen(se2.compose(frames[robot], poses)) for robot, poses in T_local_base.items()
     }
     return Fusion(maps, T_map_base, T_local_base, tuple(_closure(entry, used) for entry in entries))
-
-
-def _is_valid(entry: ClosureEntry) -> bool:
-    return entry.is_between and not entry.vetoed and entry.closure.status is not ClosureStatus.CANDIDATE
 
 
 def _match(entry: ClosureEntry, T_local_base: Mapping[str, FloatArray], order: Sequence[str]) -> _Match:
@@ -96,22 +97,13 @@ def _links(matches: Sequence[_Match]) -> _Links:
     return two
 
 
-def _relation(matches: Sequence[_Match]) -> FloatArray:
-    """T_a_b (3,) of two robots' own maps; NaN if the points do not give its rotation."""
-    # A robot may claim to be so far away that its two points are one to a computer.
-    try:
-        return two_point_alignment([match.xy_a for match in matches], [match.xy_b for match in matches])
-    except ValueError:
-        return np.full(3, np.nan)
-
-
 def _join(robots: tuple[str, str], T_a_b: FloatArray, maps: list[list[str]], frames: dict[str, FloatArray]) -> bool:
-    """Put the younger of two robots' maps into the older one's frame; False if they are one or no relation is known.
+    """Put the younger of two robots' maps into the older one's frame; False if they are one.
 
     ``maps`` and ``frames`` (T_map_local of each robot) are changed.
     """
     map_a, map_b = (next(members for members in maps if robot in members) for robot in robots)
-    if map_a is map_b or not np.isfinite(T_a_b).all():
+    if map_a is map_b:
         return False
     T_older_younger = se2.compose(se2.compose(frames[robots[0]], T_a_b), se2.inverse(frames[robots[1]]))
     older, younger = map_a, map_b

@@ -1,7 +1,7 @@
 """Tags in camera images: where they are in the robot's base. The images stay on the robot."""
 
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -32,8 +32,6 @@ HEADING_SIGMA_RAD: Final = 0.02
 LARGEST_SIGMAS: Final = np.array((0.5, 0.5, 0.25))
 """A pose with a larger standard deviation, in metres and radians, is not sent."""
 WORST_CONDITION: Final = 1e12
-_ROUNDS: Final = 4
-_STEP: Final = 1e-6
 
 
 class TagsConfig(Settings):
@@ -110,6 +108,8 @@ def tag_in_base(
         square: the same corners on the tag, shape (4, 3), metres: x to the right, y up, z towards the viewer.
         camera: its calibration and mounting.
     """
+    from scipy.optimize import approx_fprime, least_squares  # most images show no tag
+
     matrix = np.array(((camera.fx, 0.0, camera.cx), (0.0, camera.fy, camera.cy), (0.0, 0.0, 1.0)))
     R_base_camera = rotation_matrix(camera.T_base_camera.rotation)
     offset = np.array(camera.T_base_camera.translation_m)
@@ -131,19 +131,18 @@ def tag_in_base(
         return np.array((position[0], position[1], np.arctan2(axis[1], axis[0])))
 
     guesses = _two_poses(square, corners, matrix)
-    fitted = sorted(((_fit(residuals, guess)) for guess in guesses), key=lambda pose: _chi2(residuals, pose))
-    if not fitted or not np.isfinite(_chi2(residuals, fitted[0])) or _chi2(residuals, fitted[0]) > LARGEST_CHI2:
+    fitted = sorted((least_squares(residuals, guess, method="lm") for guess in guesses), key=lambda fit: fit.cost)
+    if not fitted or not 2.0 * fitted[0].cost <= LARGEST_CHI2:  # false for NaN
         return None
-    best = fitted[0]
+    best = fitted[0].x
     T_base_tag = in_plane(best)
     for other in fitted[1:]:
-        is_other = abs(se2.wrap_angle(in_plane(other)[2] - T_base_tag[2])) > HEADING_SIGMA_RAD
-        if is_other and _chi2(residuals, other) < _chi2(residuals, best) + AMBIGUITY_CHI2:
+        is_other = abs(se2.wrap_angle(in_plane(other.x)[2] - T_base_tag[2])) > HEADING_SIGMA_RAD
+        if is_other and 2.0 * (other.cost - fitted[0].cost) < AMBIGUITY_CHI2:
             return None
     if best[5] <= 0.0 or MOST_TILT <= abs(normal(best)[2]) <= np.sqrt(1.0 - MOST_TILT**2):
         return None
-    jacobian, projection = _jacobian(residuals, best), _jacobian(in_plane, best)
-    hessian = jacobian.T @ jacobian
+    hessian, projection = fitted[0].jac.T @ fitted[0].jac, approx_fprime(best, in_plane)
     if not np.linalg.cond(hessian) < WORST_CONDITION:
         return None
     covariance = projection @ np.linalg.inv(hessian) @ projection.T
@@ -165,24 +164,3 @@ def _two_poses(square: FloatArray, corners: FloatArray, matrix: FloatArray) -> l
         return []
     poses = [np.append(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
     return [pose for pose in poses if np.isfinite(pose).all()]
-
-
-def _fit(residuals: Any, pose: FloatArray) -> FloatArray:
-    for _ in range(_ROUNDS):
-        step, *_ = np.linalg.lstsq(_jacobian(residuals, pose), -residuals(pose), rcond=None)
-        if not _chi2(residuals, pose + step) < _chi2(residuals, pose):
-            break
-        pose = pose + step
-    return pose
-
-
-def _chi2(residuals: Any, pose: FloatArray) -> float:
-    return float(np.sum(residuals(pose) ** 2))
-
-
-def _jacobian(function: Any, pose: FloatArray) -> FloatArray:
-    """Derivatives by central differences, shape (M, 6)."""
-    steps = _STEP * np.eye(6)
-    differences = [function(pose + step) - function(pose - step) for step in steps]
-    jacobian: FloatArray = np.array(differences).T / (2.0 * _STEP)
-    return jacobian
