@@ -1,19 +1,15 @@
 """`fcslam map` on bags, names for robots, and `fcslam record`."""
 
 import csv
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.records import LaserScan, Sweep
 from fcslam.runs import read_tum
-from fcslam.sources import open_source, write_bag
+from fcslam.sources import open_source
 from tests.sources import carmen_text
 from tests.sources.bag_messages import drive, mounted, odom, save, text
-from tests.sources.camera_records import CAMERA
-from tests.sources.camera_records import drive as camera_drive
 
 pytestmark = pytest.mark.slow
 
@@ -92,12 +88,6 @@ def test_names_tell_equal_files_apart(tmp_path, bag, capsys):
     assert "so they are copies" in refused(capsys, "map", bag, f"ben={bag}", "-o", tmp_path / "out")
     assert run("map", f"anna={bag}", f"ben={twin}", "-o", tmp_path / "out") == 0
     assert robots(tmp_path / "out") == {"anna": 40, "ben": 15}
-
-
-def test_a_name_works_for_logs_too(tmp_path):
-    log = carmen_text.save(tmp_path / "a.log", carmen_text.drive(40))
-    assert run("map", f"anna={log}", "--split", 2, "-o", tmp_path / "out") == 0
-    assert robots(tmp_path / "out") == {"anna_1": 20, "anna_2": 20}
 
 
 def test_a_file_with_an_equals_sign_is_a_file(tmp_path, monkeypatch):
@@ -182,15 +172,6 @@ def test_only_force_replaces(tmp_path, bag, capsys, name):
     assert open_source(output).survey().scan_count == 12
 
 
-def test_images_and_times_of_beams_are_kept(tmp_path):
-    spun = [replace(item, sweep=Sweep(0.0, 0.1)) if isinstance(item, LaserScan) else item for item in camera_drive()]
-    write_bag(tmp_path / "run.bag", spun)
-    assert run("record", tmp_path / "run.bag", "-o", tmp_path / "run.mcap") == 0
-    source = open_source(tmp_path / "run.mcap")
-    assert source.survey().camera == CAMERA
-    assert all(item.sweep for item in source.records() if isinstance(item, LaserScan))
-
-
 def test_what_convert_refuses(tmp_path, bag, capsys):
     for name in ("a.zip", "a.clf"):
         assert f"{name}: not a kind of bag" in refused(capsys, "record", bag, "-o", tmp_path / name)
@@ -202,9 +183,3 @@ def test_what_convert_refuses(tmp_path, bag, capsys):
     assert "is a folder" in refused(capsys, "record", bag, "-o", tmp_path / "dir.bag", "--force")
     assert "cannot be written" in refused(capsys, "record", bag, "-o", bag / "a.mcap")
     assert "no such file" in refused(capsys, "record", tmp_path / "none.bag", "-o", tmp_path / "a.mcap")
-
-
-def test_a_log_without_a_clock_before_zero_cannot_be_a_bag(tmp_path, capsys):
-    log = carmen_text.save(tmp_path / "a.log", carmen_text.drive(40, start_stamp=-5.0))
-    assert "ROS counts from 0 s" in refused(capsys, "record", log, "-o", tmp_path / "a.bag")
-    assert {path.name for path in tmp_path.iterdir()} == {"a.log"}

@@ -40,14 +40,6 @@ def test_what_cannot_be_mapped_ends_with_the_reason(tmp_path, capsys):
     assert "no laser scans" in last
 
 
-def test_a_recording_without_odometry_is_said_to_have_none(tmp_path, capsys):
-    said = [message for message in drive(40) if message.topic != "/odom"]
-    assert main(["info", str(save(tmp_path / "run1.bag", said))]) == 0
-    *_, note, last = capsys.readouterr().out.splitlines()
-    assert "no odometry, so scan matching alone gives the motion" in note
-    assert last == "can be mapped"
-
-
 def test_a_dense_scanner_of_any_range_can_be_mapped_as_the_text_says(tmp_path, capsys):
     laser = LaserModel(7200, -np.pi, 2.0 * np.pi / 7200, 1e5)
     ranges_m = np.full(7200, 3.0, np.float32)
@@ -75,8 +67,3 @@ def test_json_holds_the_same(bag, capsys):
     assert found["bag"]["topics"][1]["name"] == "/scan"
     assert found["lasers"][0]["model"]["beam_count"] == 8
     assert found["problem"] is None
-
-
-def test_no_recording_is_one_line(tmp_path, capsys):
-    assert main(["info", str(tmp_path / "nowhere.bag")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1

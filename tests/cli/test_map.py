@@ -98,15 +98,6 @@ def test_all_robots_lie_in_one_map_to_five_centimetres(run, drawn):
             assert np.hypot(*(seen - expected)[near, :2].T).max(initial=0.0) < 0.05
 
 
-def test_what_came_out_is_said(logs, tmp_path, capsys):
-    assert run_map(logs[0], "--output", tmp_path / "a[bold]" / "run") == 0
-    out, err = capsys.readouterr()
-    assert f"map: {tmp_path / 'a[bold]' / 'run' / 'map.png'}\n" in out
-    assert "robot_1" in out
-    assert any("closures within robots" in line and line.endswith("between them") for line in out.splitlines())
-    assert "Traceback" not in err
-
-
 def test_one_recording_split_into_robots(logs, tmp_path, drawn):
     assert run_map(logs[0], "--split", 2, "--output", tmp_path / "run") == 0
     rows = rows_of(tmp_path / "run" / "robots.csv")
@@ -269,12 +260,6 @@ def test_a_run_is_only_replaced_with_force(tmp_path, log, capsys):
     assert "--force" in refused(capsys, tmp_path, log, "--output", run)
     assert "no such file" in refused(capsys, tmp_path, tmp_path / "none.log", "--output", run, "--force")
     assert (run / "metrics.json").stat().st_mtime_ns == before
-
-
-def test_an_output_inside_a_file_is_refused(tmp_path, log, capsys):
-    assert "output folder" in refused(capsys, tmp_path, log, "--output", log / "run")
-    assert "not a run folder" in refused(capsys, tmp_path, log, "--output", log, "--force")
-    assert log.read_text().startswith("ODOM")
 
 
 @pytest.mark.parametrize(

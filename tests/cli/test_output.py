@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.cli import BAD_INPUT, main
 from fcslam.cli.output import new_folder
-from tests.sources.carmen_text import drive, flaser, pose_at, save
+from tests.sources.carmen_text import drive, save
 
 pytestmark = pytest.mark.slow
 
@@ -33,14 +33,6 @@ def test_map_makes_a_run_folder_and_prints_where(tmp_path, monkeypatch, capsys):
         assert len(list(Path("runs").iterdir())) == runs
 
 
-def test_a_recording_without_stamps_has_no_speed(tmp_path, capsys):
-    log = save(tmp_path / "no_clock.log", [flaser(0.0, pose_at(step)) for step in range(40)])
-    assert main(["map", str(log), "-o", str(tmp_path / "run")]) == 0
-    streams = capsys.readouterr()
-    assert "real time" not in streams.out + streams.err
-    assert "40 scans in" in streams.out
-
-
 def test_quiet_map_prints_its_answer_only(tmp_path, capsys):
     log = save(tmp_path / "robot.log", [*drive(40), "ODOM x"])
     assert main(["map", str(log), "-o", str(tmp_path / "loud")]) == 0
@@ -49,13 +41,6 @@ def test_quiet_map_prints_its_answer_only(tmp_path, capsys):
     out, error = capsys.readouterr()
     assert error == ""
     assert out.endswith(f"map: {tmp_path / 'run' / 'map.png'}\n")
-
-
-def test_a_bad_recording_leaves_no_folder(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(["map", "none.log", "--quiet"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert list(tmp_path.rglob("runs/*")) == []
 
 
 def test_the_last_lines_say_why_maps_are_apart_and_name_every_picture(tmp_path, capsys):

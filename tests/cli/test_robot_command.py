@@ -191,28 +191,6 @@ def test_a_robot_that_waits_for_a_dead_server_says_so_and_shows_what_waits():
     assert re.search(r"sending 0/7, .*offline, 7 waiting", text)
 
 
-def test_a_robot_that_has_sent_everything_shows_no_old_count():
-    console = Console(file=io.StringIO(), width=200)
-    with ProgressDisplay(console, interval_s=0.05) as display:
-        watch = robot_watch(display, console, total=10)
-        for waiting, confirmed in ((7, 0), (0, 7)):
-            watch(
-                RobotStatus(
-                    scans=10,
-                    keyscans=3,
-                    waiting=WaitingPackets(waiting, 0),
-                    confirmed=confirmed,
-                    map_index=0,
-                    quality=0.5,
-                )
-            )
-        display.show("learning", 1, 100)
-        time.sleep(0.2)
-    text = console.file.getvalue()
-    assert "learning 1/100" in text
-    assert "sending" not in text
-
-
 def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives():
     """The learning process gets each change; a test of its own covers it."""
     told = []

@@ -72,14 +72,6 @@ def test_a_role_without_rights_is_told(postgres, postgres_server, tmp_path, caps
     assert "GRANT CREATE ON DATABASE" in line
 
 
-def test_a_store_of_a_newer_version_is_told(postgres, postgres_server, tmp_path, capsys):
-    postgres.rows("UPDATE version SET number = number + 1 RETURNING 1")
-    try:
-        assert "this fcslam reads version" in refused([postgres_server.url], tmp_path, capsys)
-    finally:
-        postgres.rows("UPDATE version SET number = number - 1 RETURNING 1")
-
-
 def test_a_name_that_is_taken_is_told(postgres, postgres_server, tmp_path, capsys):
     postgres.rows("DELETE FROM instances RETURNING 1")
     port = free_port()

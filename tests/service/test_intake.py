@@ -156,12 +156,6 @@ def test_the_number_of_a_refused_packet_is_used_up_so_the_next_ones_are_acknowle
     assert [(number, bool(reason)) for _, number, reason in desk.store.refusals("a")] == [(3, True)]
 
 
-def test_two_packets_with_one_number_are_a_conflict(desk):
-    desk.take(*DATA[:3])
-    with pytest.raises(PacketConflictError):
-        desk.take(encode(replace(PACKETS[3], sequence=2)))
-
-
 def test_bytes_that_are_no_batch_change_nothing(desk):
     with pytest.raises(PacketError, match="batch"):
         desk.intake.take("a", "x", write_batch(DATA[:2])[:-1], -1)
@@ -219,16 +213,3 @@ def test_packets_that_wait_for_one_before_them_keep_out_neither_it_nor_other_rob
 def test_a_robot_that_is_called_like_a_session_is_refused(desk, name):
     with pytest.raises(PacketError, match="session of 'a'"):
         desk.take(robot=name)
-
-
-def test_jumps_of_the_clock_change_no_answer(tmp_path):
-    """An hour forth and back, at the server."""
-    answers = []
-    for name, jumps_s in (("steady", (0.0, 0.0, 0.0)), ("jumps", (3600.0, -3600.0, 0.0))):
-        store, jumping = MissionStore(tmp_path / name), iter(jumps_s)
-        intake = Intake(store, lambda: 100.0, lambda jumping=jumping: 1e9 + next(jumping, 0.0))
-        batches = (DATA[:2], DATA[2:4], DATA[4:])
-        answers.append([intake.take("a", "x", write_batch(batch), -1).batch for batch in batches])
-        answers[-1] += [packet.data for _, packet in store.arrivals(0, 100)]
-        store.close()
-    assert answers[0] == answers[1]

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -306,13 +305,6 @@ def test_corrections_leave_while_there_is_still_a_queue(cloud):
     assert each == list(range(waiting[0], -1, -1)), "a packet takes longer than a look here: each is a step"
 
 
-def test_a_quick_worker_looks_after_a_number_of_packets_all_the_same(cloud):
-    cloud.put(two_robots())
-    cloud.tick = 0.0
-    cloud.worker.step()
-    assert cloud.store.applied() == AT_ONCE < len(cloud.store.envelopes())
-
-
 def test_a_packet_that_ends_worker_after_worker_is_refused_and_the_mission_goes_on(cloud, tmp_path):
     packets = two_robots()
     bad = next(k for k, packet in enumerate(packets) if k > 70 and isinstance(packet.body, Place))
@@ -435,17 +427,6 @@ def test_a_worker_that_is_told_to_stop_while_it_compiles_does_so_at_once(cloud):
         assert process.wait(60) == -signal.SIGTERM
 
 
-def test_a_veto_counts_from_the_next_result_on_and_survives_a_restart(cloud):
-    cloud.put(two_robots())
-    assert {t.map_index for t in cloud.finalize().trajectories.values()} == {0}
-    cloud.store.edit(Veto("a", "b"), "boss", 0.0)
-    for _ in range(2):
-        run = cloud.finalize()
-        assert {t.map_index for t in run.trajectories.values()} == {0, 1}
-        assert {c.status for c in run.closures} == {ClosureStatus.REVOKED}
-        cloud.restart()
-
-
 def content(run):
     """The contents of a run about robots and maps, without its traffic."""
     poses = {name: (robot.map_index, robot.T_map_base.tobytes()) for name, robot in run.trajectories.items()}
@@ -559,19 +540,6 @@ def test_more_robots_join_a_mission_that_was_finished(cloud):
     cloud.restart()
     cloud.put(packets)
     assert content(cloud.finalize()) == expected()
-
-
-def test_a_later_session_of_a_robot_joins_a_mission_that_was_finished(cloud, scripted):
-    scripted(closures(("a", POSES), ("a+1", POSES), [(0, 0), (8, 8), (16, 16), (24, 24)]))
-    first, again = stream("a", POSES, start_s=0.0), stream("a", POSES, start_s=600_000.0)
-    cloud.put(first)
-    assert {t.robot: t.map_index for t in cloud.finalize().trajectories.values()} == {"a": 0}
-    cloud.restart()
-    hello = replace(again[0], epoch=1, body=replace(again[0].body, epoch=1))
-    cloud.put([hello, *(replace(packet, epoch=1) for packet in again[1:])])
-    run = cloud.finalize()
-    assert {t.robot: t.map_index for t in run.trajectories.values()} == {"a": 0, "a+1": 0}
-    assert {"map.pgm", "map.yaml", "map.png"} == set(run.map_files)
 
 
 def test_nothing_of_the_packets_stays_in_the_workers_memory(cloud):

@@ -5,7 +5,6 @@ import io
 import json
 import re
 import zipfile
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import ANY
@@ -19,18 +18,14 @@ from fcslam.cloud import recognition
 from fcslam.errors import InputError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.maps.palette import ROBOTS
-from fcslam.mission.mission_store import MissionStore
-from fcslam.records import Channel, Correction, Keyscan, ReasonCode
-from fcslam.runs import open_run
+from fcslam.records import Channel, Correction, Keyscan
 from fcslam.service.http import operations
-from fcslam.service.http import prometheus as measures
 from fcslam.wire import fcslam_pb2 as pb
-from fcslam.wire.batches import read_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, VERSION
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import decode, encode, readdress
 from tests.scripted import LASER, ScriptedMatcher
-from tests.service.http.desk import POSES, SCRIPT, A, B, Desk, put_detector
+from tests.service.http.desk import SCRIPT, A, B, Desk, put_detector
 
 pytestmark = pytest.mark.slow
 
@@ -105,14 +100,6 @@ def test_what_the_worker_refuses_later_is_told_with_every_answer_and_why_on_aski
     assert (refused["epoch"], refused["sequence"], "keyscan" in refused["reason"]) == (0, 9, True)
     assert get(desk, "robots/a").json()["refused"] == [refused]
     assert desk.send("b", B[:2]).headers["Fcslam-Refused"] == "0", "it is not its own"
-
-
-def test_a_second_agent_is_refused(desk):
-    desk.told(desk.send("a", A[:2]))
-    response = desk.send("a", A[2:4], **{"Fcslam-Agent": "y"})
-    assert (response.status_code, "another agent" in response.json()["error"]) == (409, True)
-    desk.now += 31.0
-    desk.told(desk.send("a", A[2:4], **{"Fcslam-Agent": "y"}))
 
 
 @pytest.mark.parametrize("announced", [True, False])
@@ -221,11 +208,6 @@ def test_viewers_get_the_files_of_the_live_run(shown):
         assert shown.ask("GET", f"{API}/{path}", "eye").status_code in (400, 404)
 
 
-@pytest.mark.parametrize("path", [f"maps/{10**300}.png", f"maps/0/tiles/0/{10**30}/0.png"])
-def test_numbers_that_no_map_has_are_refused_and_no_fault_of_the_service(shown, path):
-    assert shown.ask("GET", f"{API}/{path}", "eye").status_code == 400
-
-
 def test_before_the_first_map_there_is_none(desk):
     assert get(desk, "fleet").json()["robots"] == []
     assert get(desk, "maps").json() == []
@@ -254,13 +236,6 @@ def test_a_part_of_a_map_that_did_not_change_is_not_sent_again(shown, part):
     assert (again.status_code, again.content) == (304, b"")
     other = shown.ask("GET", path, "eye", headers={"If-None-Match": '"of another map"'})
     assert (other.status_code, other.content) == (200, first.content)
-
-
-def test_a_result_is_a_run_folder(mapped):
-    answer = mapped.ask("POST", f"{API}/finalize", "boss").json()
-    run = open_run(Path(answer["run"]))
-    assert sum(len(t.stamps) for t in run.trajectories.values()) == 2 * len(POSES)
-    assert mapped.ask("POST", f"{API}/finalize", "boss").json()["number"] == answer["number"] + 1
 
 
 def test_a_result_can_be_downloaded(mapped, tmp_path):
@@ -292,41 +267,6 @@ def test_a_veto_parts_what_only_it_held_together(mapped):
     ):  # fmt: skip
         assert edit(mapped, "veto", wrong).status_code == status, wrong
     assert "b+x" in edit(mapped, "veto", {"robot_i": "a", "robot_j": "b+x"}).text
-
-
-def test_edits_of_every_kind_reach_the_result_and_their_undos_leave_no_trace(mapped):
-    def result():
-        run = open_run(mapped.ask("POST", f"{API}/finalize", "boss").json()["run"])
-        poses = {name: trajectory.T_map_base.tobytes() for name, trajectory in run.trajectories.items()}
-        return run, (poses, run.map_files, run.pose_graph_g2o, [str(closure.reason) for closure in run.closures])
-
-    before, plain = result()
-    closure = get(mapped, "closures?status=accepted").json()[0]
-    i, j, stamps = closure["robot_i"], closure["robot_j"], [closure["stamp_i"], closure["stamp_j"]]
-    moment = {"session": i, "stamp": stamps[0]}
-    corners = {"polygon": [[-2, -2], [2, -2], [0, 2]]}
-    made = {
-        "pin": {"robot_i": i, "robot_j": j, "stamps": stamps},
-        "closure": {
-            "robot_i": i, "stamp_i": stamps[0], "robot_j": j, "stamp_j": stamps[1], "T_i_j": closure["T_i_j"],
-            "tolerance": [0.5, 0.5],
-        },
-        "cut": {"session": j, "first_s": stamps[1] + 1.0, "last_s": stamps[1] + 2.0},
-        "placement": {**moment, "pose": [50.0, 60.0, 0.5]},
-        "region": {"use": "keep-out", "name": "", **moment, **corners},
-    }  # fmt: skip
-    assert [edit(mapped, kind, content).status_code for kind, content in made.items()] == 5 * [201]
-    assert edit(mapped, "region", {"use": "area", "name": "hall", **moment, **corners}).status_code == 201
-    run, _ = result()
-    assert {c.reason.code for c in run.closures} >= {ReasonCode.PINNED, ReasonCode.MADE_BY_HAND}
-    trajectory = run.trajectories[i]
-    assert trajectory.T_map_base[list(trajectory.stamps).index(stamps[0])] == pytest.approx((50.0, 60.0, 0.5))
-    assert run.map_files.keys() - before.map_files.keys() == {
-        "map_areas.geojson", "map_keepout.pgm", "map_keepout.yaml"
-    }  # fmt: skip
-    for number in range(1, 7):
-        assert mapped.ask("POST", f"{API}/edits/{number}/undo", "boss").status_code == 201
-    assert result()[1] == plain
 
 
 def test_who_has_the_first_poses_of_a_trajectory_gets_the_others_unless_those_moved(shown):
@@ -567,28 +507,6 @@ def test_every_panel_of_the_dashboard_asks_for_a_metric_that_there_is(shown):
     assert described == there
 
 
-def test_the_age_is_that_of_the_oldest_packet_without_effect(desk):
-    """The desk's worker stands still."""
-    metrics = measures.ServiceMetrics(lambda: 1e9 + desk.now)
-    desk.state.mission.worker.notify = lambda: None
-
-    def age():
-        text = metrics.text(desk.state.mission).decode()
-        (line,) = (line for line in text.splitlines() if line.startswith("fcslam_oldest_packet_age_seconds "))
-        return float(line.split()[1])
-
-    assert age() == 0.0
-    desk.told(desk.send("a", A[:5]))
-    desk.now += 7.0
-    desk.told(desk.send("a", A[5:9]))
-    desk.now += 3.0
-    assert age() == 10.0
-    desk.state.mission.store.progress(5, [])
-    assert age() == 3.0
-    desk.state.mission.store.progress(9, [])
-    assert age() == 0.0
-
-
 def test_what_robots_sent_is_counted_on_when_the_service_starts_again(tmp_path, scripted):
     scripted()
     with Desk(tmp_path / "data") as desk:
@@ -605,28 +523,6 @@ def test_what_robots_sent_is_counted_on_when_the_service_starts_again(tmp_path, 
         again.ask("POST", f"{API}/missions", "boss", json={"name": "next"})
         again.told(again.send("a", A[:2]))
         assert uplink(again, "a") == refused + sum(map(len, A[:2])), "missions are told apart, and none is forgotten"
-
-
-def test_measures_say_what_robots_were_told_by_kind(mapped):
-    def measured(kind):
-        line = f'fcslam_answer_bytes_total{{kind="{kind}",robot="a"}} '
-        found = [row for row in get(mapped, "../../metrics").text.splitlines() if row.startswith(line)]
-        return float(found[0].removeprefix(line)) if found else 0.0
-
-    before = [measured(kind) for kind in ("acknowledgement", "correction")]
-    told = [data for _ in range(3) for data in read_batch(mapped.send("a", A[-1:]).content)]
-    sizes = Counter()
-    for data in told:
-        sizes[type(decode(data).body)] += len(data)
-    after = [measured(kind) for kind in ("acknowledgement", "correction")]
-    assert [b - a for a, b in zip(before, after, strict=True)] == [sizes[Acknowledgement], sizes[Correction]]
-    assert all(sizes.values())
-
-
-def test_the_interface_describes_itself(desk):
-    told = desk.ask("GET", "/openapi.json").json()
-    assert PACKETS.replace("/a/", "/{robot}/") in told["paths"]
-    assert desk.ask("GET", "/docs").status_code == 404
 
 
 def test_a_robot_can_fetch_a_detector(desk):
@@ -651,10 +547,3 @@ def test_robots_with_a_camera_are_told_of_a_newer_detector_until_they_have_it(de
     assert not any(isinstance(body, DetectorUpdate) for body in desk.told(desk.send("b", B[:2]))), "it has no camera"
     assert get(desk, "detectors").json() == [{"channel": "camera", "version": version, "announced": True}]
     assert desk.ask("POST", f"{API}/detectors", "boss", content=b"no network").status_code == 400
-
-
-def test_packets_are_on_disk_before_they_are_acknowledged(desk):
-    desk.told(desk.send("a", A[:7]))
-    seen = MissionStore(desk.state.mission.folder.store)
-    assert [packet.data for _, packet in seen.arrivals(0, 100)] == A[:7]
-    seen.close()
