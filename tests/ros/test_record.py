@@ -5,20 +5,18 @@ import sys
 import threading
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 
 from fcslam.cli import main
 from fcslam.errors import InputError
-from fcslam.records import LaserScan
 from fcslam.ros.inbox import Inbox
 from fcslam.ros.node import await_sensors
 from fcslam.ros.record import record
 from fcslam.ros.ros2 import INSTALL, Ros2Network
 from fcslam.sources import BagOptions, open_source
-from fcslam.sources.bags.codec import MULTI_ECHO_SCAN, ODOMETRY, SCAN, TRANSFORMS
+from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
 from tests.ros.memory_network import MemoryNetwork, offered
-from tests.ros.ros_messages import encoded, multi_echo, odometry, scan, transform
+from tests.ros.ros_messages import encoded, odometry, scan, transform
 
 RANGES = [5.0] * 180
 
@@ -75,18 +73,6 @@ def largest_file(size_bytes):
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-def test_a_recording_of_several_echoes_is_read_by_the_first(tmp_path):
-    network = MemoryNetwork([offered("/echoes", MULTI_ECHO_SCAN), offered("/odom", ODOMETRY)])
-    messages = []
-    for stamp in range(1, 9):
-        messages.append(("/odom", ODOMETRY, odometry(stamp, (stamp, 0.0, 0.0))))
-        messages.append(("/echoes", MULTI_ECHO_SCAN, multi_echo(stamp, RANGES)))
-    assert recorded(network, tmp_path / "day.mcap", messages) == []
-    source = open_source(tmp_path / "day.mcap", BagOptions(laser_poses=((0.0, 0.0, 0.0),)))
-    scans = [record for record in source.records() if isinstance(record, LaserScan)]
-    np.testing.assert_array_equal([scan.ranges_m for scan in scans], [RANGES] * 8)
 
 
 def test_a_full_disk_keeps_what_was_recorded_before(tmp_path):

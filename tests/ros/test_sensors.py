@@ -171,14 +171,6 @@ def test_the_odometry_in_tf_is_that_of_the_laser():
     assert (robot.sensors.planner.odom_frame, robot.sensors.planner.base_frame) == ("odom", "base_link")
 
 
-def test_the_odometry_in_tf_may_be_named():
-    robot = Robot(odometry=None, odom_frame="world").hears("/tf_static", transform(0.0, "base_link", "laser"))
-    for stamp in np.arange(1.0, 9.0):
-        robot.hears("/tf", transform(stamp, "world", "base_link", (stamp, 0.0, 0.0)))
-        robot.hears("/scan", scan(stamp, RANGES))
-    assert robot.records[3].T_odom_base[0] == 4.0
-
-
 def test_scans_of_another_frame_on_the_topic_are_left_out_and_said(robot):
     robot.drives(np.arange(1.0, 7.0))
     robot.hears("/scan", scan(6.5, RANGES, frame="rear"))
@@ -387,21 +379,6 @@ def test_a_range_max_that_grows_cuts_no_range(robot):
     assert robot.records[0].laser.max_range_m == 20.0
     assert (record.ranges_m == 25.0).all()
     assert record.laser.max_range_m > 25.0
-
-
-def test_sectors_of_a_turn_are_joined(robot):
-    for number in range(40):
-        stamp = 1.0 + 0.05 * number
-        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0)))
-        sector = scan(
-            stamp, np.full(90, 1.0 + number % 4), angle_min=-np.pi + np.pi / 2 * (number % 4), beam_s=0.05 / 90
-        )
-        robot.hears("/scan", sector)
-    robot.hears("/odom", odometry(4.0, (4.0, 0.0, 0.0)))
-    assert robot.stamps == pytest.approx(1.0 + 0.2 * np.arange(10))
-    for record in robot.records:
-        assert np.array_equal(record.ranges_m, np.repeat(np.float32([1, 2, 3, 4]), 90))
-        assert record.sweep.duration_s == pytest.approx(0.2 * 359 / 360)
 
 
 @pytest.mark.parametrize(("columns", "directions"), [(480, 720), (180, 360)])

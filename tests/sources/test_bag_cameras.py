@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from fcslam.errors import SourceError
 from fcslam.records import CameraImage, LaserScan
 from fcslam.sources import BagOptions, Fault, open_source, write_bag
-from tests.sources.camera_records import CAMERA, drive, image, png, same, scan
+from tests.sources.camera_records import CAMERA, drive, image, png, same
 
 pytestmark = pytest.mark.slow
 
@@ -35,13 +35,6 @@ def test_images_and_their_camera_read_back_to_the_last_bit(tmp_path, name):
     assert all(map(same, [r for r in records if isinstance(r, CameraImage)], images(source)))
     assert len(images(source)) == 10
     assert not source.faults
-
-
-def test_an_image_between_two_readings_gets_the_pose_in_between(tmp_path):
-    write_bag(tmp_path / "run.mcap", [scan(1.0), image(1.25), scan(1.5, (1.0, 0.0, 0.0)), image(9.0)])
-    poses = [record.T_odom_base for record in images(open_source(tmp_path / "run.mcap"))]
-    assert poses[0].tolist() == [0.5, 0.0, 0.0]
-    assert poses[1] is None
 
 
 def test_others_read_the_camera(tmp_path):

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from math import hypot
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -80,31 +80,25 @@ class OdometryUpdates:
         return True
 
 
-class _Track(NamedTuple):
-    stamps: np.ndarray
-    poses: np.ndarray
-
-    def at(self, stamps: np.ndarray) -> np.ndarray:
-        """Poses at ``stamps`` (N,), interpolated, shape (N, 3); before the first and after the last these two."""
-        return np.stack([np.interp(stamps, self.stamps, axis) for axis in self.poses.T], axis=1)
-
-
 def moving_sweep(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> Sweep:
     """The sweep with the motion by odometry: the least-squares fit of a constant acceleration, or none if it jumps.
 
     ``readings`` are those up to the scan and beyond it, the newest last; those of a clock that stepped back are left
     out.
     """
-    track = _around(sweep, stamp, readings)
-    if track is None:
+    near = _around(sweep, stamp, readings)
+    if len(near) < 2:
         return sweep
+    stamps, poses = np.array([reading.stamp for reading in near]), np.array([reading.T_odom_base for reading in near])
+    poses[:, 2] = np.unwrap(poses[:, 2])
     # Odometry that ends within the sweep says nothing about the rest of it: the fit goes on.
-    begin_s = max(min(sweep.first_s, sweep.last_s), track.stamps[0] - stamp)
-    end_s = min(max(sweep.first_s, sweep.last_s), track.stamps[-1] - stamp)
+    begin_s = max(min(sweep.first_s, sweep.last_s), stamps[0] - stamp)
+    end_s = min(max(sweep.first_s, sweep.last_s), stamps[-1] - stamp)
     if end_s - begin_s < 0.5 * sweep.duration_s:
-        begin_s, end_s = track.stamps[0] - stamp, track.stamps[-1] - stamp
+        begin_s, end_s = stamps[0] - stamp, stamps[-1] - stamp
     times = np.linspace(begin_s, end_s, SAMPLES)
-    motion = se2.between(track.at(np.array([stamp]))[0], track.at(stamp + times))
+    at = np.stack([np.interp(stamp + np.append(0.0, times), stamps, axis) for axis in poses.T], axis=1)
+    motion = se2.between(at[0], at[1:])
     design = np.stack((times, 0.5 * times**2), axis=1)
     (velocity, acceleration), *_ = np.linalg.lstsq(design, motion, rcond=None)
     if np.abs(acceleration).max() > LARGEST_ACCELERATION:
@@ -115,7 +109,7 @@ def moving_sweep(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> Swe
     return sweep._replace(velocity=(vx, vy, vtheta), acceleration=(ax, ay, atheta))
 
 
-def _around(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> _Track | None:
+def _around(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> list[Reading]:
     first_s, last_s = stamp + min(0.0, sweep.first_s, sweep.last_s), stamp + max(0.0, sweep.first_s, sweep.last_s)
     near: list[Reading] = []
     for reading in reversed(readings):
@@ -126,9 +120,5 @@ def _around(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> _Track |
         near.append(reading)
         if reading.stamp <= first_s and len(near) > 1:
             break
-    if len(near) < 2:
-        return None
     near.reverse()
-    poses = np.array([reading.T_odom_base for reading in near])
-    poses[:, 2] = np.unwrap(poses[:, 2])
-    return _Track(np.array([reading.stamp for reading in near]), poses)
+    return near

@@ -56,10 +56,8 @@ class PosedImage(NamedTuple):
     """None if there is no reading within 1 s."""
 
 
-class _PoseMatch(NamedTuple):
-    T_odom_base: Pose
-    fault: Fault | None
-
+_PoseMatch = tuple[Pose, Fault | None]
+"""A pose and its fault."""
 
 Message = ScanMessage | ImageMessage | OdometryReading
 Entry = PosedScan | PosedImage | OdometryReading
@@ -96,7 +94,7 @@ class OdometryPairing:
             elif self._updates.is_fresh(item.stamp, item.T_odom_base):
                 _assign_poses(queue, readings[-1] if readings else None, item)
                 readings.append(item)
-            queue.append(_QueuedItem(number, item, _PoseMatch(item.T_odom_base, None)))
+            queue.append(_QueuedItem(number, item, (item.T_odom_base, None)))
         else:
             queue.append(_QueuedItem(number, item, _look_back(readings, item.stamp)))
         while queue and (self._is_complete(queue[0]) or len(queue) > _LONGEST_QUEUE or self._is_held_by_image()):
@@ -136,13 +134,13 @@ def _with_pose(waiting: _QueuedItem, readings: deque[OdometryReading]) -> tuple[
     if isinstance(waiting.item, OdometryReading):
         return waiting.number, waiting.item
     match = waiting.match or _nearest_pose(readings, waiting.item.stamp)
+    T_odom_base, fault = match
     if isinstance(waiting.item, ImageMessage):
-        unknown = match.fault is Fault.NO_ODOMETRY
-        return waiting.number, PosedImage(waiting.item, None if unknown else match.T_odom_base)
+        return waiting.number, PosedImage(waiting.item, None if fault is Fault.NO_ODOMETRY else T_odom_base)
     scan = waiting.item
-    if scan.sweep is not None and match.fault is not Fault.NO_ODOMETRY:
+    if scan.sweep is not None and fault is not Fault.NO_ODOMETRY:
         scan = scan._replace(sweep=moving_sweep(scan.sweep, scan.stamp, readings))
-    return waiting.number, PosedScan(scan, *match)
+    return waiting.number, PosedScan(scan, T_odom_base, fault)
 
 
 def _assign_poses(queue: deque[_QueuedItem], previous: OdometryReading | None, newest: OdometryReading) -> None:
@@ -169,7 +167,7 @@ def _look_back(readings: deque[OdometryReading], stamp: float) -> _PoseMatch | N
     if not readings or stamp > readings[-1].stamp:
         return None
     if stamp == readings[-1].stamp:
-        return _PoseMatch(readings[-1].T_odom_base, None)
+        return (readings[-1].T_odom_base, None)
     oldest = readings[-1]
     for after, before in pairwise(reversed(readings)):
         if before.stamp > after.stamp:
@@ -183,14 +181,14 @@ def _look_back(readings: deque[OdometryReading], stamp: float) -> _PoseMatch | N
 def _between(before: OdometryReading, after: OdometryReading, stamp: float) -> _PoseMatch:
     for reading in (after, before):
         if stamp == reading.stamp:
-            return _PoseMatch(reading.T_odom_base, None)
+            return (reading.T_odom_base, None)
     span_s = after.stamp - before.stamp
     pose = interpolated_pose(before.T_odom_base, after.T_odom_base, (stamp - before.stamp) / span_s)
-    return _PoseMatch(pose, Fault.ODOMETRY_GAP if span_s > MAX_GAP_S else None)
+    return (pose, Fault.ODOMETRY_GAP if span_s > MAX_GAP_S else None)
 
 
 def _nearest_pose(readings: Iterable[OdometryReading], stamp: float) -> _PoseMatch:
     nearest = min(readings, key=lambda reading: abs(reading.stamp - stamp), default=None)
     if nearest is None or abs(nearest.stamp - stamp) > MAX_GAP_S:
-        return _PoseMatch((0.0, 0.0, 0.0), Fault.NO_ODOMETRY)
-    return _PoseMatch(nearest.T_odom_base, Fault.HELD_ODOMETRY if nearest.stamp != stamp else None)
+        return ((0.0, 0.0, 0.0), Fault.NO_ODOMETRY)
+    return (nearest.T_odom_base, Fault.HELD_ODOMETRY if nearest.stamp != stamp else None)
