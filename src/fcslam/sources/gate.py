@@ -108,17 +108,12 @@ def scan_window(
 def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_count: int, first_errors: str = "") -> None:
     """Reject a recording with too many inconsistent or damaged scans; ``first_errors`` say what is damaged."""
     broken = sum(faults[kind].count for kind in (Fault.BROKEN_LINE, Fault.BROKEN_MESSAGE))
-    other, contradictory, misplaced, reversals = (
-        faults[kind] for kind in (Fault.OTHER_BEAMS, Fault.BAD_BEAMS, Fault.MISPLACED_SCAN, Fault.TIME_REVERSAL)
+    other, misplaced, reversals = (
+        faults[kind] for kind in (Fault.OTHER_BEAMS, Fault.MISPLACED_SCAN, Fault.TIME_REVERSAL)
     )
     if broken > scan_count + odometry_count:
         raise SourceError(
             f"{path}: most {faults.unit}s are damaged{first_errors}, {faults}; copy or export the recording again"
-        )
-    if contradictory.count > scan_count:
-        raise SourceError(
-            f"{path}: {faults.unit} {contradictory.first_line}: the ranges of {contradictory.count} scans do not fit "
-            "angle_min, angle_max and angle_increment; correct the laser's driver and record again"
         )
     if other.count > scan_count:
         raise SourceError(

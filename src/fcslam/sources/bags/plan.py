@@ -1,7 +1,6 @@
 """Decides once, before a bag is read, which of its topics and frames are read, and how."""
 
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, islice
 from math import degrees, tau
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import NamedTuple
 from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.records import Sweep
-from fcslam.sources.bags.camera import Calibration, ImageMessage, image_of
+from fcslam.sources.bags.camera import Calibration, image_of
 from fcslam.sources.bags.census import BagMessage
 from fcslam.sources.bags.cloud_scans import BagScans, calibration_in, valid
 from fcslam.sources.bags.codec import LASER_SCANS, ODOMETRY, SCANS
@@ -145,9 +144,8 @@ def plan_of(robot: BagRobot, options: BagOptions) -> BagPlan:
 class _Planner:
     def __init__(self, robot: BagRobot, options: BagOptions) -> None:
         self._robot, self._options, self._bag, self._path = robot, options, robot.bag, robot.bag.path
-        self._topics = choose_topics(
-            _known_topics(robot), options, partial(_view_rad, robot), partial(_has_images, robot)
-        )
+        known = KnownTopics(robot.topics, robot.transforms, f"{robot.bag.path}: ")
+        self._topics = choose_topics(known, options, self._view_rad, self._has_images)
         self._tree = robot.bag.tree(robot.transforms)
         self._scans = BagScans(robot, self._topics.scans, options, self._tree, self._base_frame_of)
         self._notes: list[str] = []
@@ -195,7 +193,7 @@ class _Planner:
         if self._options.odom_topic == NO_ODOMETRY:
             return None
         for candidate in self._odometry_candidates(frame):
-            error = "" if candidate.edge is not None else _odometry_error(self._robot, candidate.topics[0])
+            error = "" if candidate.edge is not None else self._odometry_error(candidate.topics[0])
             readings = chain.from_iterable(valid(self._bag.read(candidate.topics), candidate.readings))
             fault = f"cannot be read ({error})" if error else fault_of_odometry(each.T_odom_base for each in readings)
             if fault is None or not (error or self._scans_change()):
@@ -258,54 +256,43 @@ class _Planner:
         )
 
     def _clock_ahead_s(self, odometry: OdometryInput) -> float:
-        def scan_ends(message: BagMessage) -> list[float]:
-            return [self._scans.scan(message, self._options.cloud_band).end]
-
-        def reading_ends(message: BagMessage) -> list[float]:
-            return [reading.stamp for reading in odometry.readings(message)]
-
-        found = []
-        for topics, ends_of in ((self._topics.scans[:1], scan_ends), (odometry.topics, reading_ends)):
-            lags_s = []
-            for message in islice(self._bag.read(topics), _READINGS_TRIED):
-                ends_s = chain.from_iterable(valid([message], ends_of))
-                lags_s += [message.bag_time_ns / 1e9 - end_s for end_s in ends_s]
-            if len(lags_s) < _FEWEST_LAGS:
-                return 0.0
-            low_s, middle_s, high_s = quantiles(lags_s, n=4)
-            if high_s - low_s > _LARGEST_DELAY_S:
-                return 0.0
-            found.append(middle_s)
-        ahead_s = found[0] - found[1]
-        if abs(ahead_s) < _LARGEST_DELAY_S:
+        band = self._options.cloud_band
+        scans_s = self._lag_s(self._topics.scans[:1], lambda message: [self._scans.scan(message, band).end])
+        odometry_s = self._lag_s(odometry.topics, lambda message: [each.stamp for each in odometry.readings(message)])
+        if scans_s is None or odometry_s is None or abs(scans_s - odometry_s) < _LARGEST_DELAY_S:
             return 0.0
         self._notes.append(
-            f"{self._path}: the clock of {odometry.name} is {ahead_s:.3f} s ahead of that of the scans by the times of "
-            "recording; corrected"
+            f"{self._path}: the clock of {odometry.name} is {scans_s - odometry_s:.3f} s ahead of that of the scans by "
+            "the times of recording; corrected"
         )
-        return ahead_s
+        return scans_s - odometry_s
 
+    def _lag_s(self, topics: Sequence[Topic], ends_of: Callable[[BagMessage], list[float]]) -> float | None:
+        """Usual time from the measurement to the recording of a message; None if it varies, or there are too few."""
+        lags_s = [
+            message.bag_time_ns / 1e9 - end_s
+            for message in islice(self._bag.read(topics), _READINGS_TRIED)
+            for end_s in chain.from_iterable(valid([message], ends_of))
+        ]
+        if len(lags_s) < _FEWEST_LAGS:
+            return None
+        low_s, middle_s, high_s = quantiles(lags_s, n=4)
+        return middle_s if high_s - low_s <= _LARGEST_DELAY_S else None
 
-def _known_topics(robot: BagRobot) -> KnownTopics:
-    return KnownTopics(robot.topics, robot.transforms, f"{robot.bag.path}: ")
+    def _has_images(self, topic: Topic) -> bool:
+        images = valid(
+            islice(self._bag.read([topic]), _IMAGES_TRIED),
+            lambda message: image_of(message.content, topic.type, message.bag_time_ns),
+        )
+        return next(images, None) is not None
 
+    def _view_rad(self, topic: Topic) -> float:
+        if topic.type not in LASER_SCANS:
+            return tau
+        scan = next(valid(self._bag.read([topic]), lambda message: message.content), None)
+        return 0.0 if scan is None else scan.beams.span_rad
 
-def _odometry_error(robot: BagRobot, topic: Topic) -> str:
-    first = [message.decoded for message in islice(robot.bag.read([topic]), _READINGS_TRIED)]
-    is_bad = topic.type == ODOMETRY and first and all(isinstance(each, ValueError) for each in first)
-    return str(first[0]) if is_bad else ""
-
-
-def _has_images(robot: BagRobot, topic: Topic) -> bool:
-    def image(message: BagMessage) -> ImageMessage:
-        return image_of(message.content, topic.type, message.bag_time_ns)
-
-    return next(valid(islice(robot.bag.read([topic]), _IMAGES_TRIED), image), None) is not None
-
-
-def _view_rad(robot: BagRobot, topic: Topic) -> float:
-    if topic.type not in LASER_SCANS:
-        return tau
-    scans = valid(robot.bag.read([topic]), lambda message: message.content)
-    scan = next(scans, None)
-    return 0.0 if scan is None else scan.beams.span_rad
+    def _odometry_error(self, topic: Topic) -> str:
+        first = [message.decoded for message in islice(self._bag.read([topic]), _READINGS_TRIED)]
+        is_bad = topic.type == ODOMETRY and first and all(isinstance(each, ValueError) for each in first)
+        return str(first[0]) if is_bad else ""
