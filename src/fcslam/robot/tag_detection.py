@@ -142,7 +142,8 @@ def tag_in_base(
             return None
     if best[5] <= 0.0 or MOST_TILT <= abs(normal(best)[2]) <= np.sqrt(1.0 - MOST_TILT**2):
         return None
-    hessian, projection = fitted[0].jac.T @ fitted[0].jac, approx_fprime(best, in_plane)
+    jacobian: FloatArray = np.array(fitted[0].jac)
+    hessian, projection = jacobian.T @ jacobian, approx_fprime(best, in_plane)
     if not np.linalg.cond(hessian) < WORST_CONDITION:
         return None
     covariance = projection @ np.linalg.inv(hessian) @ projection.T
