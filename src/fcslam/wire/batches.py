@@ -23,11 +23,7 @@ LENGTH = struct.Struct(">I")
 
 
 def write_batch(packets: Iterable[bytes]) -> bytes:
-    """Join encoded packets to one batch; no packets give no bytes.
-
-    Raises:
-        PacketError: there are too many packets, one is empty or too long, or the batch is too long.
-    """
+    """Join encoded packets to one batch; no packets give no bytes."""
     chosen = tuple(packets)
     _check_count(len(chosen))
     for index, packet in enumerate(chosen):

@@ -23,11 +23,7 @@ class Label(NamedTuple):
 
 
 def encode(packet: Packet) -> bytes:
-    """Encode a packet. Keypoints are rounded to 1 cm and information matrices to float32; the rest is exact.
-
-    Raises:
-        PacketError: the packet exceeds a limit of the format; the message says which.
-    """
+    """Encode a packet. Keypoints are rounded to 1 cm and information matrices to float32; the rest is exact."""
     check(packet)
     kind = KIND_OF_TYPE[type(packet.body)]
     _, write, _ = CODECS[kind]
@@ -89,21 +85,16 @@ def readdress(data: bytes, epoch: int, sequence: int) -> bytes:
 
 
 def read_label(data: bytes) -> Label:
-    """Robot, kind and channel of a packet; its body is not decoded or checked.
-
-    Raises:
-        PacketError: ``data`` is not a packet of this version, or a place of an unknown channel.
-    """
+    """Robot, kind and channel of a packet; its body is not decoded or checked."""
     message, kind = _parse(data)
     check_name(message.robot, "robot")
     return Label(message.robot, kind, read_channel(message.place.channel) if kind is PacketKind.PLACE else None)
 
 
 def unpacked_size(data: bytes) -> int:
-    """Bytes of a packet with its streams unpacked, computed from its counts without decoding the body.
+    """Bytes of a packet with its streams unpacked, by its counts: a short stream may take as long to decode.
 
-    Rate limits use this size, as a short stream may take as long to decode as a long one. For bytes that are not a
-    packet it is their length; ``decode`` refuses them before it unpacks anything.
+    For bytes that are not a packet it is their length; ``decode`` refuses them before it unpacks anything.
     """
     try:
         message, kind = _parse(data)
