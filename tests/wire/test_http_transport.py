@@ -66,11 +66,6 @@ def test_a_batch_that_is_too_large_is_an_error_of_its_own(cloud, transport):
         transport.send(PACKETS, -1)
 
 
-def test_asking_for_what_is_new_sends_no_bytes(cloud, transport):
-    assert transport.send((), -1) == HttpResponse()
-    assert cloud.requests[0][3] == b""
-
-
 def test_a_refused_packet_is_told_by_its_place(cloud, transport):
     cloud.canned.append(error(400, "bad", index=1))
     assert transport.send(PACKETS, -1) == HttpResponse(refusal=(1, f"{cloud.url}: bad (400)"))
@@ -116,12 +111,6 @@ def test_answers_that_are_none(cloud, transport):
         transport.send(PACKETS, -1)
 
 
-def test_an_answer_that_cannot_be_unpacked_is_none(cloud, transport):
-    cloud.canned.append((200, {"Content-Encoding": "gzip"}, b"noise"))
-    with pytest.raises(UnavailableError, match=cloud.url):
-        transport.send(PACKETS, -1)
-
-
 @pytest.mark.parametrize(
     "body", [b"<html>", b"[]", b"{}", b'{"next": {}}', b'{"next": {"a": 1}, "refused": []}', b'{"next": [1]}']
 )
@@ -129,13 +118,6 @@ def test_another_server_is_no_cloud(cloud, transport, body):
     cloud.canned.append((200, {}, body))
     with pytest.raises(CloudError, match="does not come from an fcslam cloud"):
         transport.state()
-
-
-def test_nobody_there_is_no_reason_to_give_up():
-    away = HttpTransport("http://127.0.0.1:9", "r", "ab" * 16)
-    with pytest.raises(UnavailableError, match=r"127\.0\.0\.1:9"):
-        away.state()
-    away.close()
 
 
 def test_where_an_instance_does_not_answer_the_next_one_is_asked_and_stays(cloud):

@@ -42,14 +42,6 @@ def test_ranges_come_back(expected):
     assert np.array_equal(unpack_ranges(packed, len(expected)), expected)
 
 
-@pytest.mark.parametrize("value", [0, 1, 65535])
-def test_the_longest_scan_of_one_range(value):
-    expected = np.full(4096, value, np.uint16)
-    packed = pack_ranges(expected)
-    assert len(packed) < 100
-    assert np.array_equal(unpack_ranges(packed, 4096), expected)
-
-
 @pytest.mark.parametrize("axes", [2, 3])
 @given(data=st.data())
 def test_keypoints_come_back(axes, data):
