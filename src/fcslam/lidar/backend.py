@@ -129,16 +129,17 @@ class LidarBackend:
         for c in closures:
             self._graph.add_edge(Edge(c.earlier, c.later, c.check.T_a_b, c.check.information, robust=True))
         self._optimize_if_needed(closures)
-        return tuple(self._constraint(closure) for closure in closures)
-
-    def _constraint(self, closure: LocalClosure) -> Constraint:
-        return Constraint(
-            self.robot,
-            self._closer.keyscans[closure.earlier],
-            self._closer.keyscans[closure.later],
-            ConstraintKind.CLOSURE,
-            frozen(closure.check.T_a_b),
-            frozen(closure.check.information),
+        keyscans = self._closer.keyscans
+        return tuple(
+            Constraint(
+                self.robot,
+                keyscans[c.earlier],
+                keyscans[c.later],
+                ConstraintKind.CLOSURE,
+                frozen(c.check.T_a_b),
+                frozen(c.check.information),
+            )
+            for c in closures
         )
 
     def _optimize_if_needed(self, closures: list[LocalClosure]) -> None:

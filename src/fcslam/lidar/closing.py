@@ -303,20 +303,15 @@ def supported(pending: Sequence[LocalClosure], travel: FloatArray, anchors: Floa
     if len(pending) < MINIMUM_SUPPORT:
         return []
     consistent = consistency(pending, travel, anchors)
-    clusters = [list(compress(pending, row)) for row in consistent[::-1]]
-    enough = [cluster for cluster in clusters if _is_enough(cluster, travel)]
-    return max(enough, key=_support, default=[])
-
-
-def _support(cluster: Sequence[LocalClosure]) -> float:
-    """At most the number of the closures."""
-    return sum(c.check.support for c in cluster)
-
-
-def _is_enough(cluster: Sequence[LocalClosure], travel: FloatArray) -> bool:
-    spread_m = np.ptp(travel[[c.later for c in cluster]])
-    informative = any(c.check.informative for c in cluster)
-    return bool(_support(cluster) >= MINIMUM_SUPPORT and spread_m >= MINIMUM_SPREAD_M and informative)
+    best: tuple[float, list[LocalClosure]] = 0.0, []
+    for row in consistent[::-1]:
+        cluster = list(compress(pending, row))
+        support = sum(c.check.support for c in cluster)
+        is_spread = np.ptp(travel[[c.later for c in cluster]]) >= MINIMUM_SPREAD_M
+        informative = any(c.check.informative for c in cluster)
+        if support >= MINIMUM_SUPPORT and is_spread and informative and support > best[0]:
+            best = support, cluster
+    return best[1]
 
 
 def consistency(closures: Sequence[LocalClosure], travel: FloatArray, anchors: FloatArray) -> NDArray[np.bool_]:

@@ -211,9 +211,6 @@ class ScanTracker:
             turned_rad=state.turned_rad + abs(turn),
         )
 
-    def _explains(self, match: ScanMatch) -> bool:
-        return match.explained >= DOUBTFUL * match.known
-
     def _is_long_step(self, T_local_guess: FloatArray) -> bool:
         x, y, theta = se2.motion(self._state.T_local_base, T_local_guess)
         return math.hypot(x, y) > LONG_STEP_M or abs(theta) > LONG_STEP_RAD
@@ -247,7 +244,7 @@ class ScanTracker:
             match = match_scan(thinned, field, T_local_guess, error.information, velocity)
         innovation = se2.motion(T_local_guess, match.T_field_base)
         log_posterior = match.log_likelihood + learned.log_likelihood(innovation)
-        is_doubtful = not self._explains(match) or learned.mahalanobis2(innovation) >= FAR**2
+        is_doubtful = match.explained < DOUBTFUL * match.known or learned.mahalanobis2(innovation) >= FAR**2
         is_unlikely = log_posterior < self._state.usual * len(thinned) - UNLIKELY  # False before the first match
         if not is_doubtful and not is_unlikely:
             return match
@@ -281,12 +278,8 @@ def _likeliest(
 def _corrected(sweep: Sweep | None, velocity: FloatArray) -> Sweep | None:
     if sweep is None:
         return None
-    (x, y, theta), (dx, dy, dtheta) = sweep.velocity, velocity.tolist()
-    return sweep._replace(velocity=(_bounded(x + dx), _bounded(y + dy), _bounded(theta + dtheta)))
-
-
-def _bounded(velocity: float) -> float:
-    return min(max(velocity, -LARGEST_VELOCITY), LARGEST_VELOCITY)
+    x, y, theta = np.clip(np.add(sweep.velocity, velocity), -LARGEST_VELOCITY, LARGEST_VELOCITY).tolist()
+    return sweep._replace(velocity=(x, y, theta))
 
 
 def _learn_usual(usual: float, likelihood: float) -> float:
