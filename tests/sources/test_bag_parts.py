@@ -1,7 +1,5 @@
 """One recording in several files: parts joined by commas, or a folder without metadata."""
 
-import shutil
-
 import pytest
 
 from fcslam.errors import SourceError
@@ -43,19 +41,6 @@ def test_parts_are_one_recording(tmp_path, suffix):
         assert_same(scans_of(source), whole)
 
 
-def test_a_folder_of_parts_with_metadata_is_read_by_it(tmp_path):
-    files = parts(tmp_path / "parts", ".mcap")
-    folder = save(tmp_path / "run", drive(60))
-    lines = (folder / "metadata.yaml").read_text()
-    for file in files:
-        shutil.copy(file, folder)
-    names = "".join(f"\n  - {file.name}" for file in files)
-    assert "\n  - run.mcap" in lines
-    (folder / "metadata.yaml").write_text(lines.replace("\n  - run.mcap", names))
-    (folder / "run.mcap").unlink()
-    assert len(scans_of(open_source(folder))) == 60
-
-
 def test_a_folder_of_bag_folders_is_one_recording(tmp_path):
     whole = scans_of(open_source(save(tmp_path / "whole.mcap", drive(60))))
     messages = sorted(drive(60), key=lambda message: message.bag_time)
@@ -79,12 +64,9 @@ def test_a_folder_of_bag_folders_of_several_robots_is_refused(tmp_path):
         open_source(tmp_path / "fleet").survey()
 
 
-@pytest.mark.parametrize("with_metadata", [True, False])
-def test_the_last_part_may_be_cut_off(tmp_path, with_metadata):
+def test_the_last_part_may_be_cut_off(tmp_path):
     files = parts(tmp_path / "run", ".mcap")
     files[-1].write_bytes(files[-1].read_bytes()[:-3000])
-    if with_metadata:
-        (tmp_path / "run" / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
     source = open_source(tmp_path / "run")
     assert 45 < len(scans_of(source)) <= 60
     assert "run_2.mcap: is cut off or damaged, read up to" in " ".join(source.survey().notes)

@@ -11,8 +11,8 @@ from fcslam.sources import BagOptions, Fault, FaultCount, open_source, write_bag
 from tests.carmen_logs import write_carmen
 from tests.sources.bag_messages import drive, mounted, odom, pose_at, scan, tf
 from tests.sources.bag_messages import save as save_bag
-from tests.sources.carmen_text import flaser, robotlaser, save, scans_of
 from tests.sources.carmen_text import pose_at as log_pose
+from tests.sources.carmen_text import robotlaser, save, scans_of
 
 SICK = LaserModel(181, -math.pi / 2, math.radians(1.0), 50.0)
 TURNING = LaserModel(1100, -math.pi, math.tau / 1100, 12.0)
@@ -58,18 +58,6 @@ def test_every_format_keeps_the_beams_of_each_scan(tmp_path, kind, name):
 
 
 # Logs that state no angles
-
-
-def log_of_counts(counts):
-    return [flaser(100 + 0.1 * k, log_pose(k), ranges=(1.0,) * count) for k, count in enumerate(counts)]
-
-
-def test_a_log_of_one_count_is_what_it_was(tmp_path):
-    lines = log_of_counts([180] * 60)
-    lines[30] = flaser(103.0, log_pose(30), ranges=(1.0,) * 181)
-    source = open_source(save(tmp_path / "run.log", lines))
-    assert [round(math.degrees(angle)) for angle in scans_of(source)[0].laser.angles_rad()[[0, -1]]] == [-90, 89]
-    assert source.faults[Fault.OTHER_BEAMS] == FaultCount(1, 31)
 
 
 def test_lines_that_state_their_angles(tmp_path):
