@@ -38,7 +38,3 @@ def test_a_batch_has_points_within_its_views():
     assert float(points.min()) >= 4.0
     assert float(x.max()) <= 91.0
     assert float(y.max()) <= 59.0
-
-
-def test_no_images_give_no_views():
-    assert draw_views([], 3) == []

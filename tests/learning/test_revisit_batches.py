@@ -47,11 +47,6 @@ def test_a_batch_holds_pairs_of_views():
     assert torch.equal(batch.points, again.points)
 
 
-def test_examples_are_false_only_without_any():
-    assert not RevisitExamples(IMAGES)
-    assert RevisitExamples(IMAGES, [PAIR])
-
-
 def test_points_of_two_pairs_differ_if_they_are_far_apart_in_the_map_and_of_one_pair_if_in_both_images():
     batch = draw_revisits(RevisitExamples(IMAGES, [PAIR]), 1, 5)
     found = revisit_negatives(batch).numpy()

@@ -18,12 +18,10 @@ from fcslam.learning.pairs import TrainingExample  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
 from fcslam.learning.trainer import (  # noqa: E402
     CHECKPOINT_FILE,
-    PROGRESS_FILE,
     ExecutionOptions,
     TrainingRun,
-    read_curves,
 )
-from fcslam.learning.training_loop import learning_rate, reduced_precision  # noqa: E402
+from fcslam.learning.training_loop import learning_rate  # noqa: E402
 from fcslam.learning.validation import collapse_warnings, validate, validation_pairs  # noqa: E402
 
 CPU_FLAGS = Path("/proc/cpuinfo")
@@ -153,13 +151,6 @@ def test_the_rate_rises_stays_and_falls():
     assert rates[-1] == pytest.approx(1e-5, rel=0.1)
 
 
-@pytest.mark.skipif(not CPU_FLAGS.exists(), reason="needs Linux")
-def test_whether_a_processor_has_bfloat16_is_what_its_kernel_says():
-    with reduced_precision(torch.device("cpu")):
-        product = torch.ones(2, 2) @ torch.ones(2, 2)
-    assert (product.dtype == torch.bfloat16) == ("avx512_bf16" in CPU_FLAGS.read_text().split())
-
-
 def test_neighbours_in_either_view_are_no_negatives():
     first = [[0.0, 0.0], [3.0, 0.0], [50.0, 0.0], [90.0, 0.0]]
     second = [[0.0, 0.0], [30.0, 0.0], [60.0, 0.0], [63.0, 0.0]]
@@ -188,10 +179,3 @@ def test_teacher_bits_are_balanced_and_keep_angles():
     hamming = torch.cdist(bits[:50].float(), bits[:50].float()).square()
     upper = torch.triu(torch.ones(50, 50), 1) > 0
     assert torch.corrcoef(torch.stack((angles[upper], hamming[upper])))[0, 1] > 0.8
-
-
-@pytest.mark.slow
-def test_a_log_that_a_full_disk_left_empty_gets_its_head(examples, tmp_path):
-    (tmp_path / PROGRESS_FILE).touch()
-    TrainingRun(SMALL, tmp_path, PACE).train(examples, examples[:1])
-    assert read_curves(tmp_path / PROGRESS_FILE)["detector"][0] == [1, 2, 3, 4, 5, 6]

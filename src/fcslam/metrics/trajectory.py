@@ -16,9 +16,6 @@ from fcslam.geometry.alignment import n_point_alignment
 from fcslam.metrics.relations import PoseTable, RelationErrors, motion_errors
 from fcslam.records import SAME_STAMP_S, FloatArray
 
-_DRAWS_PER_PAIR = 50
-"""Random pairs drawn for each wanted pair, because most are too far apart."""
-
 
 @dataclass(frozen=True, slots=True)
 class PositionErrors:
@@ -114,7 +111,7 @@ def near_pairs(
     """Up to ``count`` random pairs of rows (P, 2) whose true positions are less than ``reach_m`` apart."""
     if not len(truth.stamps):
         return np.empty((0, 2), dtype=np.int64)
-    rows: NDArray[np.int64] = rng.integers(0, len(truth.stamps), (_DRAWS_PER_PAIR * count, 2))
+    rows: NDArray[np.int64] = rng.integers(0, len(truth.stamps), (50 * count, 2))
     first, second = rows.T
     near = np.hypot(*(truth.T_map_base[first, :2] - truth.T_map_base[second, :2]).T) < reach_m
     across = truth.robots[first] != truth.robots[second]

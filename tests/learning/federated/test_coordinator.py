@@ -8,14 +8,12 @@ import pytest
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
-from evaluation.federated.poison import PoisonedClient
 
 from fcslam.errors import InputError
 from fcslam.learning.federated.aggregation import average
 from fcslam.learning.federated.checkpoint import read_checkpoint
 from fcslam.learning.federated.client import InProcessFleet
 from fcslam.learning.federated.rounds import ROUNDS_FILE
-from fcslam.learning.federated.screening import ScreeningBounds
 from fcslam.learning.trainer import CHECKPOINT_FILE
 from tests.learning.federated.fakes import START, Fake, rules, run, settings, shifted, version
 
@@ -68,14 +66,6 @@ def test_a_round_merges_as_a_hand_would(name, aggregate, share, tmp_path):
     for array, value in weights.items():
         assert state.weights[array] == pytest.approx(value, rel=1e-6, abs=1e-6)
     assert not same(state.weights, START)
-
-
-def test_the_length_of_the_last_updates_is_kept_for_the_next_round(tmp_path):
-    state, _ = run([Fake("a", 1.0), Fake("b", 1.0)], tmp_path, settings(rounds=2))
-    trained = [name for name in START if not name.endswith(("running_mean", "running_var"))]
-    assert state.update_length == pytest.approx(np.sqrt(sum(START[name].size for name in trained)), rel=1e-6)
-    again, _ = run([Fake("a", 1.0), Fake("b", 1.0)], tmp_path, settings(rounds=2))
-    assert again.update_length == state.update_length
 
 
 @pytest.mark.parametrize(("robots", "most"), [(1, 0.0), (2, 0.5), (4, 0.75)])
@@ -266,13 +256,6 @@ def test_after_a_collapse_the_mean_begins_anew_as_well(tmp_path):
     assert judged[3]["b.weight"] == pytest.approx(judged[1]["b.weight"] + (1.0 - min(share, 3 / 12)))
 
 
-def test_a_mean_never_reaches_beyond_what_it_is_of(tmp_path):
-    """However low the learning rate: that of training has a floor."""
-    chosen = settings(rounds=12, training={"learning_rate": 1e-6})
-    state, _ = run([Fake("a", 1.0)], tmp_path, chosen, rules=rules(smoothing=0.8))
-    assert 0.5 < float(state.average["b.weight"]) < float(state.weights["b.weight"]) == 12.5
-
-
 def test_what_does_not_change_stays_to_the_last_bit_in_the_mean(tmp_path):
     frozen = {"a.running_var": START["a.running_var"] / 3}
     robot = Fake("a", answer=lambda weights, _round: shifted(weights, 0.1) | frozen)
@@ -288,30 +271,6 @@ def test_a_start_that_beats_what_follows_is_no_place_to_go_back_to(tmp_path):
     assert same(state.weights, shifted(START, 1.0))
 
 
-@pytest.mark.parametrize("poison", ["flipped", "scaled", "random", "nan"])
-def test_a_poisoned_robot_of_five_changes_nothing(poison, tmp_path):
-    """The others end where they would have ended without it."""
-    start = {"weight": np.random.default_rng(0).normal(size=100_000).astype(np.float32)}
-    common = np.random.default_rng(1).normal(size=100_000)
-
-    def towards(seed):
-        def answer(weights, round_number):
-            own = np.random.default_rng([seed, round_number]).normal(size=100_000)
-            return {"weight": (weights["weight"] + 0.02 * (0.5 * common + own)).astype(np.float32)}
-
-        return answer
-
-    def fleet():
-        return [Fake(f"r{seed}", answer=towards(seed)) for seed in range(4)]
-
-    chosen, own = settings(rounds=3), rules(bounds=ScreeningBounds(least_agreement=0.01))
-    alone, _ = run(fleet(), tmp_path / "alone", chosen, start=start, rules=own)
-    bad = PoisonedClient(Fake("bad", answer=towards(9)), poison, "bad")
-    together, reports = run([*fleet(), bad], tmp_path / "together", chosen, start=start, rules=own)
-    assert all(set(report.left_out) == {"bad"} for report in reports)
-    assert same(alone.weights, together.weights)
-
-
 def test_robots_that_were_asked_before_a_kill_are_counted(tmp_path):
     def kills(_weights, _round):
         raise KeyboardInterrupt
@@ -324,13 +283,6 @@ def test_robots_that_were_asked_before_a_kill_are_counted(tmp_path):
     _, reports = run([Fake("a"), Fake("b")], tmp_path)
     size = reports[0].bytes_up
     assert [report.bytes_down for report in reports] == [size, size], "what is sent in this round"
-
-
-def test_a_start_that_nothing_beats_stays(tmp_path):
-    scores = iter([0.5, 0.4, 0.3])
-    state, reports = run([Fake("a")], tmp_path, score=lambda _: next(scores))
-    assert (state.best_round, [report.released for report in reports]) == (0, [False, False])
-    assert same(state.best, START)
 
 
 def test_a_checkpoint_of_another_run_is_refused_but_more_rounds_are_not(tmp_path):

@@ -32,7 +32,7 @@ pytest.importorskip("torch", reason="needs fcslam[federated]")
 LIMIT_S = 900.0
 SETTINGS = {
     "fewest_pairs": 20,  # far fewer than 200, which only a test may do
-    "federated": {"rounds": 2, "local_steps": 60, "minimum_robots": 3},
+    "federated": {"rounds": 2, "local_steps": 100, "minimum_robots": 3},
 }  # fmt: skip
 BROKEN_LAYER, NOISE = "body.code_head.0.0.weight", 6.0
 """Noise in this layer, in standard deviations of its weights, makes a detector that soon learns something."""

@@ -14,7 +14,6 @@ from fcslam.errors import InputError
 from fcslam.learning.federated.client import InProcessFleet
 from fcslam.learning.federated.messages import (
     MAX_REASON_LENGTH,
-    RoundReplies,
     TrainingReply,
     TrainingRequest,
     read_reply,
@@ -101,13 +100,6 @@ def test_reasons_are_short_lines(tmp_path):
     _, reports = run(fleet(), tmp_path, fleet=TwistedFleet(fleet(), shout))
     assert {len(report.left_out["bad"]) for report in reports} == {MAX_REASON_LENGTH}
     assert all(report.left_out["bad"].isprintable() for report in reports)
-
-
-def test_who_is_left_out_counts_for_nothing():
-    answers = RoundReplies({"a": {}}, {"a": {}})
-    answers.leave_out("a", "late\nagain")
-    assert (answers.weights, answers.losses) == ({}, {})
-    assert answers.left_out == {"a": "late again"}
 
 
 def test_statistics_that_were_to_stay_are_refused_where_they_moved(tmp_path):

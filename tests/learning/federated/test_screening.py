@@ -2,12 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
-from evaluation.federated.poison import apply_update
 
 from fcslam.learning.federated.screening import (
     BOUNDS,
@@ -17,7 +14,6 @@ from fcslam.learning.federated.screening import (
     statistics_distances,
     update_length,
 )
-from fcslam.learning.federated.weights import parameter_names, update_vector, weights_error
 
 RNG = np.random.default_rng(4)
 BEFORE = {
@@ -113,20 +109,6 @@ def test_even_few_robots_are_safe_from_what_nobody_could_mean(kind, others):
 def test_two_that_disagree_are_not_judged():
     answers = {"a": honest(1), "b": poisoned("flipped")}
     assert screen(answers, BEFORE, BOUNDS) == {}
-
-
-@pytest.mark.slow
-@given(st.integers(0, 2**32 - 1))
-def test_an_update_taken_apart_and_added_again_is_the_same(seed):
-    rng = np.random.default_rng(seed)
-    before = {name: array[:7] for name, array in BEFORE.items()}
-    after = {name: (array + rng.random(array.shape)).astype(np.float32) for name, array in before.items()}
-    names = parameter_names(before)
-    back = apply_update(before, update_vector(after, before, names), names)
-    for name, array in before.items():
-        assert back[name] == pytest.approx(after[name] if name in names else array, abs=1e-6)
-    assert weights_error(after, before) is None
-    assert names == ["convolution.weight"]
 
 
 def test_agreement_is_a_cosine_with_the_mean_direction_of_the_others():

@@ -74,10 +74,10 @@ def _traffic(report: FleetReport) -> Table:
         kilobytes = score.uplink_bytes / 1e3
         rates = (_ratio(kilobytes, score.duration_s), _ratio(kilobytes, score.path_length_m))
         table.add_row(score.robot, _number(kilobytes, 1), *(_number(rate, 2) for rate in rates))
-    for channel, places in report.places.items():
-        kilobytes = places.bytes / 1e3
-        size = _number(_ratio(kilobytes, places.packets), 2)
-        table.add_row(f"{channel} places, all", _number(kilobytes, 1), "", "", _number(places.packets, 0), size)
+    for channel, (packets, size) in report.places.items():
+        kilobytes = size / 1e3
+        each = _number(_ratio(kilobytes, packets), 2)
+        table.add_row(f"{channel} places, all", _number(kilobytes, 1), "", "", _number(packets, 0), each)
     return table
 
 

@@ -65,14 +65,6 @@ class EvaluatedJoin:
 
 
 @dataclass(frozen=True, slots=True)
-class PlaceTraffic:
-    """Traffic of places; NaN if the run does not have it."""
-
-    packets: float
-    bytes: float
-
-
-@dataclass(frozen=True, slots=True)
 class FleetReport:
     """Scores of a run against the ground truth."""
 
@@ -89,7 +81,8 @@ class FleetReport:
     closures: FleetClosures
     agreement: GridAgreement | None
     """Agreement of the first map with the true map; None without a true map."""
-    places: Mapping[Channel, PlaceTraffic]
+    places: Mapping[Channel, tuple[float, float]]
+    """Packets and bytes of places; NaN if the run does not have them."""
 
     @property
     def false_joins(self) -> tuple[EvaluatedJoin, ...]:
@@ -161,8 +154,8 @@ def _agreement(run: Path, folder: Path, alignments: Mapping[int, FloatArray]) ->
     return grid_agreement(read_grid(run / "map.yaml"), read_grid(folder / TRUE_MAP), alignments[0])
 
 
-def _place_traffic(channel: Channel, figures: Mapping[str, float]) -> PlaceTraffic:
-    return PlaceTraffic(figures.get(f"{channel}_place_packets", np.nan), figures.get(f"{channel}_place_bytes", np.nan))
+def _place_traffic(channel: Channel, figures: Mapping[str, float]) -> tuple[float, float]:
+    return figures.get(f"{channel}_place_packets", np.nan), figures.get(f"{channel}_place_bytes", np.nan)
 
 
 def fleet_metrics(report: FleetReport) -> tuple[Metric, ...]:
@@ -183,9 +176,9 @@ def fleet_metrics(report: FleetReport) -> tuple[Metric, ...]:
     if report.agreement is not None:
         shares = ("precision", "recall", "f1", "free_iou")
         metrics += [Metric(f"map_{share}", getattr(report.agreement, share), "1") for share in shares]
-    for place_channel, traffic in report.places.items():
-        metrics.append(Metric(f"{place_channel}_places", traffic.packets, "1"))
-        metrics.append(Metric(f"{place_channel}_place_bytes", traffic.bytes, "B"))
+    for place_channel, (packets, size) in report.places.items():
+        metrics.append(Metric(f"{place_channel}_places", packets, "1"))
+        metrics.append(Metric(f"{place_channel}_place_bytes", size, "B"))
     return tuple(metrics)
 
 

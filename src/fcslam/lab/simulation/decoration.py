@@ -12,17 +12,11 @@ from fcslam.records import FloatArray, frozen
 
 WALL_HEIGHT_M = 2.5
 DOOR_HEIGHT_M = 2.05
-_LOW_M, _HIGH_M = 0.6, 1.9
-"""Lowest and highest furniture, always taller than the mounting height of a laser."""
-
 _WALLS, _FLOORS, _FRONTS = 8, 6, 10
 """Number of different walls, floors and furniture fronts. Every picture is unique."""
 _PICTURE_OFF_M = WALL_M / 2.0 + 0.01
-_SIGN_M = 0.24
 
 LAMP_HEIGHT_M = 2.4
-_LAMP_SPACING_M = 6.0
-"""Distance of lamps along a corridor, about."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +77,7 @@ def _is_wall(piece: Piece) -> bool:
 def _height_m(piece: Piece, rng: np.random.Generator) -> float:
     if _is_wall(piece) or (piece.kind is PieceKind.COLUMN and rng.random() < 0.5):
         return WALL_HEIGHT_M
-    return float(rng.uniform(_LOW_M, _HIGH_M))
+    return float(rng.uniform(0.6, 1.9))  # always above the mounting height of a laser
 
 
 def _pictures(room: Room, rng: np.random.Generator) -> list[WallPicture]:
@@ -102,7 +96,7 @@ def _pictures(room: Room, rng: np.random.Generator) -> list[WallPicture]:
             pictures.append(_hang((side, y), size, np.pi / 2.0, rng))
     outside, door = front - inward * _PICTURE_OFF_M, float(room.doorway[0])
     sign = textures.door_sign(rng)
-    pictures.append(WallPicture(sign, (door + 0.72, outside, 1.45), (_SIGN_M, _SIGN_M), 0.0))
+    pictures.append(WallPicture(sign, (door + 0.72, outside, 1.45), (0.24, 0.24), 0.0))
     for low, high in ((west, door - 0.6), (door + 0.9, east)):
         size = rng.uniform((0.6, 0.5), (1.1, 0.9))
         if high - low > size[0] + 0.3 and rng.random() < 0.6:
@@ -149,6 +143,6 @@ def _lamps(plan: FloorPlan) -> FloatArray:
     """Positions of lamps, one in the middle of every room and some along each corridor, shape (L, 3)."""
     points = [(room.low + room.high) / 2.0 for room in plan.rooms]
     for start, end in plan.lanes:
-        count = max(2, round(float(np.linalg.norm(end - start)) / _LAMP_SPACING_M) + 1)
+        count = max(2, round(float(np.linalg.norm(end - start)) / 6.0) + 1)  # one every six metres
         points += [start + share * (end - start) for share in np.linspace(0.0, 1.0, count)]
     return frozen(np.column_stack((np.array(points), np.full(len(points), LAMP_HEIGHT_M))))

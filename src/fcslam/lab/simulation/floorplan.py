@@ -27,8 +27,6 @@ DISC_CORNERS = 8
 
 _ATTEMPTS = 20
 """Attempts to place a piece of furniture before it is omitted."""
-_SHIFT_M, _TURN_RAD = 0.4, 0.3
-"""Standard deviations of the shift and the turn of a moved piece of furniture."""
 
 
 class PieceKind(StrEnum):
@@ -143,8 +141,8 @@ def move_furniture(
 def _moved(piece: Piece, room: Room, rng: np.random.Generator) -> Piece:
     centre, margin = piece.centre, 0.5 * float(np.hypot(*piece.size))
     for _ in range(_ATTEMPTS):
-        place = centre + rng.normal(0.0, _SHIFT_M, 2)
-        turned = (piece.outline - centre) @ rotation(rng.normal(0.0, _TURN_RAD))
+        place = centre + rng.normal(0.0, 0.4, 2)
+        turned = (piece.outline - centre) @ rotation(rng.normal(0.0, 0.3))
         fits = np.all(place > room.low + margin) and np.all(place < room.high - margin)
         if fits and distance_m(place, (room.doorway, room.inside)) > CLEARANCE_M + margin:
             return Piece(piece.kind, frozen(turned + place))

@@ -12,8 +12,6 @@ from fcslam.records import SAME_STAMP_S, FloatArray, Odometry, frozen
 
 READING_RATE_HZ = 50.0
 """Readings per second beside a LiDAR that spins."""
-_CARPET_M = 4.0
-"""Side of a piece of carpet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +126,7 @@ def simulate_odometry(T_building_base: FloatArray, errors: OdometryErrors, rng: 
         if errors.slip_turn_rad:
             wrong[:, 2] += rng.uniform(-errors.slip_turn_rad, errors.slip_turn_rad, len(travel)) * (slips > 0)
     if errors.carpet_slip:
-        column, row = np.floor(T_building_base[:-1, :2] / _CARPET_M).T % 2
+        column, row = np.floor(T_building_base[:-1, :2] / 4.0).T % 2  # pieces of 4 m
         wrong *= 1.0 + errors.carpet_slip * (column * row)[:, None]
     return _chain(se2.exp(wrong))
 

@@ -19,14 +19,8 @@ _RAMP_S, _RAMP_STEP_S = 0.3, 0.02
 """Time in which an eased drive changes its speed, and the time between its poses."""
 _STRETCH, _SHIFT = 0.85, 0.55
 """Length of a robot's part of the common walk, and offset of the next robot's part, as shares of the path length."""
-_NEXT = 2
-"""The walk continues to one of this many nearest spots."""
-_LANE_SPOTS_M = 15.0
-"""Distance of spots along a corridor, about."""
 _SWAY_M = 0.2
 """Largest random shift of a corner in x and y, so that no two passes follow the same line."""
-_LEAST_SPREAD_M = 1.0
-"""Smallest extent of a robot's goals."""
 
 
 def draw_goals(plan: FloorPlan, robots: int, length_m: float, rng: np.random.Generator) -> list[FloatArray]:
@@ -42,7 +36,7 @@ def draw_goals(plan: FloorPlan, robots: int, length_m: float, rng: np.random.Gen
     while driven[-1] < wanted_m:
         costs = space.costs(spots[walk[-1]])[spots]
         costs[walk[-max(1, 3 * len(spots) // 4) :]] = np.inf
-        nearest = np.argsort(costs, kind="stable")[: min(_NEXT, int(np.sum(np.isfinite(costs))))]
+        nearest = np.argsort(costs, kind="stable")[: min(2, int(np.sum(np.isfinite(costs))))]
         walk.append(int(rng.choice(nearest)))
         driven.append(driven[-1] + float(costs[walk[-1]]))
     goals = space.points[[spots[k] for k in walk]]
@@ -126,14 +120,14 @@ def _draw_spots(plan: FloorPlan, space: DrivableSpace, rng: np.random.Generator)
         if len(inside):
             spots.append(int(rng.choice(inside)))
     for start, end in plan.lanes:
-        count = max(1, round(float(np.linalg.norm(end - start)) / _LANE_SPOTS_M))
+        count = max(1, round(float(np.linalg.norm(end - start)) / 15.0))  # one every 15 m
         shares = (np.arange(count) + rng.uniform(0.1, 0.9, count)) / count
         spots += [space.nearest(start + share * (end - start)) for share in shares]
     return np.unique(np.array(spots, dtype=np.intp))
 
 
 def _check_spread(points: FloatArray) -> None:
-    if not len(points) or np.ptp(points, axis=0).max() < _LEAST_SPREAD_M:
+    if not len(points) or np.ptp(points, axis=0).max() < 1.0:
         raise InputError("the building's free space is too small or too divided to drive in; take a larger one")
 
 

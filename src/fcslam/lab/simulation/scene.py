@@ -18,13 +18,8 @@ CAMERA = "camera"
 LIGHTS = 5
 """Number of lights, which move to the lamps nearest to the robot; software GL supports eight at most."""
 
-_SEAM_M = 0.001
-"""Walls are shortened by this, because coplanar faces would flicker."""
 _TEXTURE_M = 2.5
 """Size of one repeat of a wall or floor texture."""
-_NEAR_M, _FAR_M = 0.05, 100.0
-_UPRIGHT = (1, -1, 2, 0, 0, 0)
-"""Quarter turns of the image on each face of a cube texture, so that it is upright."""
 
 
 def bare_model(plan: FloorPlan) -> Any:
@@ -97,7 +92,7 @@ class _Builder:
         """Add the camera and the lights, and set the clipping planes."""
         visual = self._spec.visual
         self._spec.stat.extent = 1.0
-        visual.map.znear, visual.map.zfar = _NEAR_M, _FAR_M
+        visual.map.znear, visual.map.zfar = 0.05, 100.0
         visual.global_.offwidth, visual.global_.offheight = image_size
         # Antialiasing and finer shading would cost more than everything else.
         visual.quality.offsamples, visual.quality.numquads = 0, 2
@@ -121,7 +116,8 @@ class _Builder:
         """Add a material that shows an image: repeated, once on each face of a cube, or once."""
         kinds = self._mujoco.mjtTexture
         height, width = image.shape[:2]
-        faces = [np.rot90(image, turns) for turns in _UPRIGHT] if cube else [image]
+        # Quarter turns of the image on each face of a cube make it upright.
+        faces = [np.rot90(image, turns) for turns in (1, -1, 2, 0, 0, 0)] if cube else [image]
         texture = self._spec.add_texture(
             name=name,
             type=kinds.mjTEXTURE_CUBE if cube else kinds.mjTEXTURE_2D,
@@ -152,7 +148,8 @@ class _Builder:
             if length < thick:
                 length, thick, heading = thick, length, heading + math.pi / 2.0
             low = DOOR_HEIGHT_M if piece.kind is PieceKind.LINTEL else 0.0
-            half = (length / 2.0 - _SEAM_M, (height_m - low) / 2.0, thick / 2.0)
+            # A millimetre shorter, because coplanar faces would flicker.
+            half = (length / 2.0 - 0.001, (height_m - low) / 2.0, thick / 2.0)
             group = SEEN if piece.kind is PieceKind.LINTEL else SOLID
             self.upright(half, (x, y, (low + height_m) / 2.0), heading, material, group)
 

@@ -42,17 +42,7 @@ from fcslam.sources.pose import UNKNOWN_POSE
 FIRST_STAMP = 1000.0
 STAMP_SHIFT_S = 0.001
 """Offset between the stamps of two robots, so that a stamp identifies its robot."""
-LANE_PER_ROBOT_M = 2.0
-"""Least length of corridor for each robot. Robots do not see each other, but a crowded corridor is not realistic."""
-IMAGE_DELAY_S = 0.03
-"""Time from the first scan to the first image; cameras and LiDARs are not triggered together."""
-
-CAMERA_AT_M = (0.1, 0.0, 0.6)
-"""Position of the camera in the robot's base, whose origin is on the floor."""
-JPEG_QUALITY = 90
 _T_BASE_LASER = (0.05, 0.0, 0.0)
-_AHEAD = (-0.5, 0.5, -0.5, 0.5)
-"""Quaternion (x, y, z, w) of an optical frame that looks along x of the base."""
 
 
 class CameraSettings(Settings):
@@ -68,7 +58,7 @@ class CameraSettings(Settings):
         """Intrinsics and mounting."""
         focal = 0.5 * self.width / math.tan(0.5 * self.field_of_view_rad)
         middle = (0.5 * (self.width - 1), 0.5 * (self.height - 1))
-        mounting = Transform(CAMERA_AT_M, _AHEAD)
+        mounting = Transform((0.1, 0.0, 0.6), (-0.5, 0.5, -0.5, 0.5))  # z of the camera is x of the base
         return CameraModel(self.width, self.height, focal, focal, *middle, mounting)
 
 
@@ -238,7 +228,7 @@ def simulate_fleet(settings: SimulationSettings, seed: int, world: World | None 
 
 def _check_room(plan: FloorPlan, settings: SimulationSettings) -> None:
     lanes_m = sum(float(np.linalg.norm(end - start)) for start, end in plan.lanes)
-    most = int(lanes_m / LANE_PER_ROBOT_M)
+    most = int(lanes_m / 2.0)  # robots do not see each other, but a crowded corridor is not realistic
     if settings.robots > most:
         raise InputError(
             f"building '{settings.building}': {lanes_m:.0f} m of corridors are too small for {settings.robots} robots; "
@@ -264,7 +254,7 @@ def _robot(
     first_stamp = FIRST_STAMP + number * STAMP_SHIFT_S
     stamps: FloatArray = frozen(np.round(first_stamp + times, 6))
     readings = _readings(route, times, first_stamp, settings, rng)
-    image_times = np.arange(IMAGE_DELAY_S, times[-1], 1.0 / camera.rate_hz) if camera else np.empty(0)
+    image_times = np.arange(0.03, times[-1], 1.0 / camera.rate_hz) if camera else np.empty(0)
     return SimulatedRobot(
         name=f"robot_{number + 1}",
         lasers=(settings.lidar.model(_T_BASE_LASER),),
@@ -301,5 +291,5 @@ def _jpeg(pixels: FloatArray) -> bytes:
     import cv2
 
     image = np.clip(pixels, 0.0, 255.0).astype(np.uint8)
-    _, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    _, encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
     return bytes(encoded)
