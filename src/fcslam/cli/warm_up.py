@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
     from fcslam.robot.frontend import RobotConfig
 
-FIRST_SCANS_S, EVERYTHING_S = 10, 45
-"""About what compiling takes on a laptop: what first scans need, in two processes; everything, in one."""
+FIRST_SCANS_S, EVERYTHING_S = 15, 45
+"""About what compiling takes on one core of a laptop: what first scans need, and everything."""
 
 
 def warm_up() -> None:
