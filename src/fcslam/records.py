@@ -266,8 +266,7 @@ class Keyscan:
     id: KeyscanId
     stamp: float
     ranges_m: Ranges
-    """Shape (beam_count,), as in LaserScan, but an invalid range or a missing return is 0. Shape (0,) if the ranges
-    stay on the robot."""
+    """Shape (beam_count,), as in LaserScan, but an invalid range or a missing return is 0."""
     laser: int = 0
     """Index of its laser among those that the robot announced."""
     beams: Beams | None = None

@@ -62,11 +62,8 @@ class Fleet:
     ) -> None:
         """Start without packets.
 
-        Args:
-            config: settings.
-            seed: of the random generator.
-            verify_pairs: verifies pairs of submaps, here or on a pool; the result is the same.
-            read: gives stored packets by their numbers, for ``restored``.
+        ``verify_pairs`` verifies pairs of submaps, here or on a pool; the result is the same. ``read`` gives stored
+        packets by their numbers, for ``restored``.
         """
         self._config = config
         self._verify_pairs = verify_pairs

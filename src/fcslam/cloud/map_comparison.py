@@ -82,16 +82,9 @@ class MapComparison(Kept):
     ) -> MapFit | None:
         """Compare two maps at the transform of a cluster, and at the best transforms elsewhere.
 
-        Args:
-            sessions: names of a and b.
-            a, b: their trajectories, each in its own coordinate frame.
-            members: at least one closure from a to b; together they give the transform.
-            growth: factor by which the cluster or the paths must have grown since an earlier comparison.
-
-        Returns:
-            The comparison; None if a session has no keyscan left around the places. An earlier one at the same
-            transform counts until the cluster or the paths have grown. It counts for good if keyscans
-            were released since.
+        The closures from a to b, at least one, give the transform. Returns None if a session has no keyscan left around
+        the places. An earlier comparison at the same transform counts until the cluster or the paths have grown by a
+        factor, and for good if keyscans were released since.
         """
         pair = frozenset(sessions)
         T_a_b, size = relative_frame(a, b, members), len(a) + len(b)

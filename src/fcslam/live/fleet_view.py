@@ -70,14 +70,10 @@ class FleetView:
         limit_kBps: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Follow nothing before ``start``.
+        """Follow nothing before ``start``; ``close`` closes the client.
 
-        Args:
-            client: of the cloud; ``close`` closes it.
-            robot: its name.
-            own_pose: index of its map and its pose there, if both are known.
-            limit_kBps: limit of the tiles, kB per second; None: ``DOWNLINK_KB_PER_S``.
-            clock: any, in seconds.
+        ``own_pose`` gives the index of the robot's map and its pose there, if both are known. The tiles are limited to
+        so many kB per second; None: ``DOWNLINK_KB_PER_S``.
         """
         self._client, self._robot, self._own_pose, self.clock = client, robot, own_pose, clock
         self._rng = np.random.default_rng()  # robots must not retry at the same moments

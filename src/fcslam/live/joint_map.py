@@ -69,7 +69,7 @@ class JointMap:
             keyscan = packet.body
             if isinstance(keyscan, Hello):
                 self._lasers = keyscan.lasers
-            elif isinstance(keyscan, Keyscan) and len(keyscan.ranges_m):
+            elif isinstance(keyscan, Keyscan):
                 laser = keyscan.laser_model(self._lasers)
                 on_teammates = self._met.pop(_key(keyscan.stamp, laser), None)
                 with self._lock:

@@ -113,10 +113,8 @@ class RobotBackend:
     def __init__(self, robot: str, config: SessionConfig, keyframes: Path | None = None) -> None:
         """Load the detector of camera images.
 
-        Args:
-            robot: its name.
-            config: its settings.
-            keyframes: folder that keeps the keyframes, for a process that learns from them; None: they are not kept.
+        ``keyframes`` is the folder that keeps the keyframes, for a process that learns from them; None: they are not
+        kept.
         """
         self._robot = robot
         self._config = config

@@ -68,11 +68,8 @@ class RobotFrontend:
     ) -> None:
         """Start the first session.
 
-        Args:
-            robot: its name.
-            config: its settings.
-            backend: runs the back end beside this front end; None: it runs inline.
-            mark: marks the beams of a scan that hit other robots, before it is matched.
+        ``backend`` runs the back end beside this front end; None: it runs inline. ``mark`` marks the beams of a scan
+        that hit other robots, before it is matched.
         """
         self.robot = robot
         self.tracks: list[ScanTrack] = []
@@ -129,14 +126,10 @@ class RobotFrontend:
         return self.packets.ready(wait)
 
     def set_detector(self, file: DetectorFile, path: Path) -> "Future[list[Body]]":
-        """Use another network for camera images from now on; it describes buffered images again.
+        """Use another network for camera images from now on, as the cloud announced it; it describes buffered images
+        again.
 
-        Args:
-            file: the detector as the cloud announced it.
-            path: the downloaded file.
-
-        Returns:
-            Done when the back end uses it, or refuses it with the ``FeatureError`` of ``RobotBackend.process``.
+        Done when the back end uses it, or refuses it with the ``FeatureError`` of ``RobotBackend.process``.
         """
         return self._submit(NewDetector(file, path))
 

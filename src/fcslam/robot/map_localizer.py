@@ -89,12 +89,7 @@ class MapLocalizer:
     """Localizes one robot by its keyscans; ``submit`` is the back end of a ``RobotFrontend``. It sends nothing."""
 
     def __init__(self, frozen_map: Submap, initial: FloatArray | None = None) -> None:
-        """Begin without a pose.
-
-        Args:
-            frozen_map: the map (``fcslam.lidar.frozen_map``).
-            initial: about where the first session starts in the map, shape (3,), metres and radians; None: anywhere.
-        """
+        """Begin without a pose, but perhaps with an ``initial`` one to ``suggest`` (``fcslam.lidar.frozen_map``)."""
         self._map = frozen_map
         self.estimate: MapEstimate | None = None
         """None while the robot does not know where it is in the map."""
@@ -111,11 +106,8 @@ class MapLocalizer:
     def suggest(self, T_map_odom: FloatArray) -> None:
         """Try a pose that somebody gives, as by hand: the walls that the robot sees from now on must confirm it.
 
-        Until they do, nothing changes; after ``LONGEST_STRETCH_M`` it is forgotten.
-
-        Args:
-            T_map_odom: about where the ``odom`` frame of the present session lies in the map, shape (3,), metres and
-                radians.
+        Until they do, nothing changes; after ``LONGEST_STRETCH_M`` it is forgotten. ``T_map_odom`` says about where the
+        ``odom`` frame of the present session lies in the map, shape (3,), metres and radians.
         """
         newest = self._recent[-1] if self._recent else None
         self._suggested = T_map_odom, 0.0 if newest is None else newest.travel_m

@@ -113,14 +113,9 @@ class Outbox:
         self._database.close()
 
     def begin(self, recording: str, resume: bool) -> int:
-        """Start to read a recording: in a new epoch, or resumed where it was interrupted.
+        """Start to read a recording with this fingerprint: in a new epoch, or resumed where it was interrupted.
 
-        Args:
-            recording: fingerprint of the recording and its settings.
-            resume: continue the last start, if there is one.
-
-        Returns:
-            Number of packets that the front end will produce again; 0 if nothing is resumed.
+        Returns the number of packets that the front end will produce again; 0 if nothing is resumed.
         """
         with self._transaction() as connection:
             last, before = _one(connection, "SELECT max(epoch), recording FROM sessions WHERE session = 0")
@@ -155,9 +150,7 @@ class Outbox:
         """Add the next packets of the front end. Packets that were added before an interruption are skipped.
 
         Places are dropped if the outbox is crowded: the map loses chances to close loops, but its chain stays whole.
-
-        Returns:
-            Number of dropped places.
+        Returns their number.
         """
         dropped = 0
         with self._transaction() as connection:
@@ -221,14 +214,9 @@ class Outbox:
         """Compare the sessions with those of the cloud.
 
         Sessions that the cloud has not seen move to epochs above all that it has: the robot may have had another state
-        folder before.
-
-        Args:
-            expected: next sequence number that the cloud expects, by epoch.
-
-        Returns:
-            Epoch and sequence number of waiting packets that the cloud can no longer use: those of earlier sessions
-            whose first packets it had confirmed and does not have any more.
+        folder before. ``expected`` is the next sequence number that the cloud expects, by epoch. Returns epoch and
+        sequence number of waiting packets that the cloud can no longer use: those of earlier sessions whose first
+        packets it had confirmed and does not have any more.
         """
         with self._transaction() as connection:
             newest = max(expected, default=-1)

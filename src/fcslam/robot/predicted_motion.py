@@ -98,12 +98,7 @@ class MotionPrediction:
         return replace(scan, sweep=scan.sweep._replace(velocity=(x, y, theta)))
 
     def follow(self, scan: LaserScan, T_smooth_base: FloatArray, sweep: Sweep | None) -> LaserScan:
-        """A scan that waits for a decision, with its motion as it was found; the next prediction goes on from there.
-
-        Args:
-            scan: the scan, predicted.
-            T_smooth_base, sweep: as in ``observe``.
-        """
+        """A scan that waits for a decision, with its motion as it was found; the next prediction goes on from there."""
         motion = np.zeros(3) if self._last is None else se2.between(self._last[1], T_smooth_base)
         self._T_odom_base = se2.compose(self._T_odom_last, motion)
         self.observe(scan.stamp, T_smooth_base, sweep)
@@ -114,13 +109,10 @@ class MotionPrediction:
         self._T_odom_base, self._T_odom_last = se2.compose(T, self._T_odom_base), se2.compose(T, self._T_odom_last)
 
     def observe(self, stamp: float, T_smooth_base: FloatArray | None, sweep: Sweep | None) -> None:
-        """Where the tracker found the scan.
+        """Where the tracker found the scan: its pose in a frame without jumps, shape (3,), and its matched sweep.
 
-        Args:
-            stamp: of the scan, seconds.
-            T_smooth_base: its pose in a frame without jumps, shape (3,), metres and radians. None: it was not matched;
-                then the robot is assumed to stand still, as a wrong velocity would take it ever further.
-            sweep: the sweep as it was matched.
+        None: it was not matched; then the robot is assumed to stand still, as a wrong velocity would take it ever
+        further.
         """
         elapsed_s = math.inf if self._last is None else stamp - self._last[0]
         self.is_new, self._elapsed_s, self._sweep = False, 0.0, None
@@ -199,10 +191,7 @@ class PredictedMotion:
     def relocate(self, deferred: Deferred, frontend: LidarFrontend, gap_s: float) -> bool:
         """Move doubtful scans to where the newest keyscans show them; whether they show the place before them.
 
-        Args:
-            deferred: the scans, and the images between them.
-            frontend: the robot's front end; it does not change.
-            gap_s: time before them in which nothing shows the motion; 0: there was no gap.
+        ``gap_s`` is the time before them in which nothing shows the motion; 0: there was no gap.
         """
         scans = _scans(deferred)
         found = relocated(scans, frontend)

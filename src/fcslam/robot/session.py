@@ -108,13 +108,7 @@ class Session:
         return is_measured and drove_on(self._explained, scans, self.lidar.odometry, self.lidar.trust)
 
     def map(self, scan: LaserScan, tracking: TrackingResult, fixes: Iterable[GnssFix]) -> list[BackendInput]:
-        """Continue from a localized scan; returns the keyscan that it becomes, and the fixes of keyscans.
-
-        Args:
-            scan: the scan.
-            tracking: where it was localized.
-            fixes: those up to the scan.
-        """
+        """Continue from a localized scan; returns the keyscan that it becomes, and the fixes of keyscans."""
         step = self.lidar.process(scan, tracking)
         inputs: list[BackendInput] = []
         if step.keyscan is not None:

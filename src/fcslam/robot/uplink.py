@@ -64,16 +64,9 @@ class Uplink:
     ) -> None:
         """Start both threads.
 
-        Args:
-            frontend: uses the detectors that the cloud announces.
-            outbox: begun.
-            transport: to the cloud; None: all packets stay in the outbox.
-            folder: holds refused packets and detectors.
-            rng: of the delays after failures.
-            clock: seconds.
-            correct: called in the sender's thread, with the session of this start and its correction.
-            known: number of packets that the outbox has from before an interruption, and that come again.
-            budget: None: every packet is sent.
+        The front end uses the detectors that the cloud announces. Without a transport, all packets stay in the outbox,
+        which has ``known`` packets from before an interruption that come again. The folder holds refused packets and
+        detectors. ``correct`` is called in the sender's thread, with the session of this start and its correction.
         """
         self._outbox, self._refused, self._budget = outbox, folder / "refused", budget
         self._correct_session, self._known = correct, known

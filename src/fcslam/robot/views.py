@@ -81,16 +81,9 @@ class ViewExtractor:
     ) -> CameraView | None:
         """Describe the next image.
 
-        The motion between the last scan and the image is that of the odometry, or zero if the image has none.
-
-        Args:
-            image: the image.
-            scan: the newest scan before it.
-            pose: pose of this scan.
-            scans: the newest scan of each laser.
-
-        Returns:
-            The view, or None if the image has too few keypoints, cannot be decoded, or shows little that is new.
+        ``scan`` is the newest one before it, and ``scans`` are the newest of each laser. The motion between the scan
+        and the image is that of the odometry, or zero if the image has none. None if the image has too few keypoints,
+        cannot be decoded, or shows little that is new.
         """
         odometry = scan.T_odom_base if image.T_odom_base is None else image.T_odom_base
         if not self._is_new(pose.keyscan, odometry):
