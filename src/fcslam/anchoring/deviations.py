@@ -23,9 +23,7 @@ AWAY_M: Final = 3.0 * OFF_M
 SHORTEST_M: Final = 1.5
 """Shortest wall that is missing or moved: shorter lines of a plan are furniture and doors."""
 SHORTEST_NEW_M: Final = 2.0
-"""Shortest new wall: shorter surfaces are furniture."""
-FARTHEST_M: Final = 2.0
-"""A missing wall that stands parallel within this distance has moved."""
+"""Shortest new wall, as shorter surfaces are furniture; a missing wall that stands parallel within it has moved."""
 HIDDEN_M: Final = 1.0
 """A new wall this close to a wall of the plan that no scan can see is that wall."""
 _STEPS: Final = 6
@@ -122,7 +120,7 @@ def compare_with_plan(plan: Submap, building: Submap) -> Comparison:
     taken: set[int] = set()
     found: list[Deviation] = []
     for wall in _walls(points, normals, across, passed | (~unseen & ~confirmed)):
-        match = _moved(wall, new, FARTHEST_M)
+        match = _moved(wall, new, SHORTEST_NEW_M)
         if match is not None:
             taken.add(match[0])
         by_m = wall.off_m if wall.off_m is not None else match[1] if match is not None else None

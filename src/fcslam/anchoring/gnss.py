@@ -22,10 +22,8 @@ OUTLIER: Final = 3.0
 """A fix that is farther off than this many standard deviations does not count."""
 CORRELATED_S: Final = 10.0
 """Fixes in this time have the errors of one: those of satellites, air and reflections change slowly."""
-LEAST_FIXES: Final = 10
-"""Least number of fixes that agree."""
-LEAST_SHARE: Final = 0.3
-"""Least share of the fixes that agree."""
+LEAST_FIXES, LEAST_SHARE = 10, 0.3
+"""Least number of fixes that agree, and least share of them."""
 MOST_TURN_RAD: Final = float(np.radians(3.0))
 """Largest standard deviation of the map's heading by the fixes that agree."""
 LEAST_SIGMA_M: Final = 0.02

@@ -23,7 +23,7 @@ _BINARY = 1e-4
 """Distance from 0 or 1 at which a weight is decided."""
 INLIER_WEIGHT = 0.5
 """Weight above which a closure is an inlier: graduated non-convexity ends at weight 1 (inlier) or 0 (outlier)."""
-_REFINEMENT_ROUNDS = 200
+_REFINEMENT_ROUNDS = 2 * _MAXIMUM_ITERATIONS
 """Limit of alternating solves and decisions, which end by themselves."""
 _FIRST_ITERATIONS = 5
 """Solver iterations of graduated non-convexity with all closures, before steps of one iteration each."""

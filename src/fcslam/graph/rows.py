@@ -9,7 +9,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 _SPARE = 8
 """A full array grows by 1 / 8 of its rows: appending stays cheap, and little memory is unused."""
-_LEAST = 16
+_LEAST = 2 * _SPARE
 
 
 class Rows(Generic[Scalar]):
