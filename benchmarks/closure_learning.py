@@ -70,11 +70,11 @@ from fcslam.learning.federated.networks import weights_to_network, weights_versi
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights
 from fcslam.learning.labels import WORST_QUALITY, Labels
-from fcslam.learning.local_training import LocalTrainingPlan
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample, draw_pair
 from fcslam.learning.revisits import Keyframe, predict, revisits_in_map
 from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.training_loop import LocalTrainingPlan
 from fcslam.lidar.scan import point_scan
 from fcslam.metrics.bootstrap import Interval, mean_interval
 from fcslam.metrics.trajectory import interpolate

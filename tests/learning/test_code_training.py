@@ -13,7 +13,6 @@ from fcslam.learning.code_batches import RevisitExamples, RevisitPair  # noqa: E
 from fcslam.learning.code_training import CodeInputs, train_codes  # noqa: E402
 from fcslam.learning.federated.initial_weights import read_detector_weights  # noqa: E402
 from fcslam.learning.federated.networks import weights_to_network  # noqa: E402
-from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan  # noqa: E402
 from fcslam.learning.network import (  # noqa: E402
     KeypointNetwork,
     layer_names,
@@ -21,6 +20,7 @@ from fcslam.learning.network import (  # noqa: E402
     sample_codes,
 )
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
+from fcslam.learning.training_loop import RAMP_STEPS, LocalTrainingPlan  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

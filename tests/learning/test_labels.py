@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from fcslam.errors import InputError
-from fcslam.learning.homographic_adaptation import adapt, harris, peaks
-from fcslam.learning.labels import fuse_keypoints, read_labels, read_teacher, write_labels
+from fcslam.learning.labels import adapt, fuse_keypoints, harris, peaks, read_labels, read_teacher, write_labels
 from tests.learning.textures import textured
 
 

@@ -31,8 +31,6 @@ _FIELD_SIGMA_M = 0.35
 """Standard deviation of the likelihood field around a wall."""
 _PATCH_RADIUS_M = 1.5
 """Radius of the patch that a descriptor describes."""
-_ORIENTATION_RADIUS_M = 0.8
-"""Radius of the disc whose centroid orients a descriptor."""
 _SUBCELLS = 4
 """Positions of a point are rounded to 1 / 4 of a cell."""
 
@@ -62,7 +60,7 @@ def describe(points: FloatArray, most: int = 400) -> BirdseyeFeatures:
     if corners is None:
         return BirdseyeFeatures(frozen(np.empty((0, 2)), np.float32), frozen(np.empty((0, CODE_BYTES)), np.uint8))
     pixels = corners.reshape(-1, 2).astype(np.int64)
-    directions = _directions(picture, pixels, round(_ORIENTATION_RADIUS_M / _CELL_M))
+    directions = _directions(picture, pixels, round(0.8 / _CELL_M))  # by the centroid of a disc of 0.8 m
     codes = np.packbits(_compare(picture, pixels, directions, _comparison_pattern()), axis=1)
     return BirdseyeFeatures(frozen(pixels_to_metres(pixels), np.float32), frozen(codes, np.uint8))
 

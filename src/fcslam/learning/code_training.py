@@ -7,7 +7,6 @@ keeps the codes of what the robot does not see.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
 
 import numpy as np
 import torch
@@ -17,12 +16,9 @@ from fcslam.errors import InputError
 from fcslam.features.detector import GreyImage
 from fcslam.learning.batches import on_device
 from fcslam.learning.code_batches import RevisitExamples, draw_rehearsal, draw_revisits, draw_views
-from fcslam.learning.local_training import LocalTrainingPlan, LocalTrainingResult, train_layers
 from fcslam.learning.network import Description, KeypointNetwork, layer_names, network_from_state
 from fcslam.learning.objective import REHEARSAL_WEIGHT, rehearsal_loss, revisit_objective
-from fcslam.learning.training_loop import reduced_precision
-
-_IMAGES_AT_ONCE: Final = 8
+from fcslam.learning.training_loop import LocalTrainingPlan, LocalTrainingResult, reduced_precision, train_layers
 
 
 @dataclass(slots=True)
@@ -47,8 +43,8 @@ class CodeInputs:
             self._seed = seed
             self._frozen = {name: value.clone() for name, value in frozen.items()}
             parts, shown = [], [*images, *draw_views(images, seed)]
-            for k in range(0, len(shown), _IMAGES_AT_ONCE):
-                grey = np.stack(shown[k : k + _IMAGES_AT_ONCE]).astype(np.float32) / 255.0
+            for k in range(0, len(shown), 8):
+                grey = np.stack(shown[k : k + 8]).astype(np.float32) / 255.0
                 with torch.no_grad():
                     parts.append(network.body.code_inputs(torch.from_numpy(grey).unsqueeze(1).to(device)).half())
             self._inputs = torch.cat(parts)

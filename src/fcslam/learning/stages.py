@@ -20,18 +20,25 @@ from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage, OnnxConfig
 from fcslam.learning.artifacts import Curve, Panel, TrainingReport
 from fcslam.learning.export import detector_version
-from fcslam.learning.homographic_adaptation import Response, adapt, harris, peaks
 from fcslam.learning.images import ImageFile, find_images, is_held_out, is_usable, read_image
-from fcslam.learning.labels import MOST_POINTS, Labels, Teacher, fuse_keypoints, read_labels, read_teacher, write_labels
+from fcslam.learning.labels import (
+    MOST_POINTS,
+    Labels,
+    Response,
+    Teacher,
+    adapt,
+    fuse_keypoints,
+    harris,
+    peaks,
+    read_labels,
+    read_teacher,
+    write_labels,
+)
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import TeacherBits, teacher_bits
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.trainer import PROGRESS_FILE, ExecutionOptions, TrainingProgress, TrainingRun, read_curves
-
-DESCRIPTORS_OF_AN_IMAGE: Final = 32
-"""Descriptors of each image to which the projection of a teacher's descriptors is fitted."""
-FEWEST_IMAGES: Final = 2
 
 StageCallback = Callable[[str, TrainingProgress], None]
 """Called with the name of a stage and its progress."""
@@ -105,7 +112,7 @@ def read_images(files: Sequence[ImageFile]) -> FoundImages:
     read = ((file, read_image(file.path)) for file in files)
     found = [(file, image) for file, image in read if image is not None and is_usable(image)]
     train = sum(not is_held_out(file.name) for file, _ in found)
-    if train < FEWEST_IMAGES:
+    if train < 2:
         raise InputError(
             f"only {train} of {len(files)} image files can be trained on: the others are not images, smaller than "
             "96 px or have too few corners; give more images"
@@ -182,11 +189,11 @@ def _labels(
 
 
 def _teacher_bits(examples: Sequence[TrainingExample], seed: int) -> TeacherBits | None:
-    """The projection of a teacher's descriptors to bits, fitted to some descriptors of each image."""
+    """The projection of a teacher's descriptors to bits, fitted to 32 descriptors of each image."""
     taught = [example.teacher.descriptors for example in examples if example.teacher is not None]
     if not taught:
         return None
-    some = [descriptors[:: max(len(descriptors) // DESCRIPTORS_OF_AN_IMAGE, 1)] for descriptors in taught]
+    some = [descriptors[:: max(len(descriptors) // 32, 1)] for descriptors in taught]
     return teacher_bits(torch.from_numpy(np.concatenate(some).astype(np.float32)), seed)
 
 

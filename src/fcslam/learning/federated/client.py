@@ -25,9 +25,9 @@ from fcslam.learning.federated.messages import PAIRS, TrainingReply, TrainingReq
 from fcslam.learning.federated.networks import network_to_weights, weights_to_network
 from fcslam.learning.federated.weights import Weights
 from fcslam.learning.images import find_images
-from fcslam.learning.local_training import LocalTrainingPlan, local_training
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, label_images, read_images
+from fcslam.learning.training_loop import LocalTrainingPlan, local_training
 from fcslam.learning.validation import validate, validation_pairs
 from fcslam.storage.state_file import State, read_state, write_state
 

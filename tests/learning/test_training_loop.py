@@ -7,12 +7,15 @@ from tests.learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import InputError  # noqa: E402
-from fcslam.learning.homographic_adaptation import harris, peaks  # noqa: E402
-from fcslam.learning.labels import fuse_keypoints  # noqa: E402
-from fcslam.learning.local_training import RAMP_STEPS, LocalTrainingPlan, local_training  # noqa: E402
+from fcslam.learning.labels import (  # noqa: E402
+    fuse_keypoints,
+    harris,
+    peaks,
+)
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.pairs import TrainingExample  # noqa: E402
 from fcslam.learning.settings import TrainingSettings  # noqa: E402
+from fcslam.learning.training_loop import RAMP_STEPS, LocalTrainingPlan, local_training  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
