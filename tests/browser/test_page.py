@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import socket
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
@@ -298,8 +299,8 @@ def test_a_report_tells_of_days_of_changes_and_of_accuracy(browser, tmp_path):
     moved = {"kind": "moved", "start": [-1.0, 0.0], "end": [1.0, 0.0], "length_m": 2.0, "by_m": 0.3}
     plan = {"drawing": "M-2 -2L2 -2z", "maps": [{"map": 0, "aligned": True, "deviations": [moved]}]}
     (folder / "plan.json").write_text(json.dumps(plan))
-    with ShownRun(folder) as shown:
-        (tmp_path / "report.html").write_text(asyncio.run(report_html(shown)))
+    with ShownRun(folder) as shown, ThreadPoolExecutor(1) as beside:  # Playwright has the loop of this thread
+        (tmp_path / "report.html").write_text(beside.submit(asyncio.run, report_html(shown)).result())
     with (
         closing(browser.new_context(timezone_id="UTC", locale="en-GB")) as context,
         closing(context.new_page()) as page,

@@ -2,12 +2,9 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.records import LaserModel, LaserScan
-from tests.carmen_logs import write_carmen
 from tests.sources.bag_messages import drive, save, scan
 
 pytestmark = pytest.mark.slow
@@ -38,18 +35,6 @@ def test_what_cannot_be_mapped_ends_with_the_reason(tmp_path, capsys):
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("cannot be mapped: ")
     assert "no laser scans" in last
-
-
-def test_a_dense_scanner_of_any_range_can_be_mapped_as_the_text_says(tmp_path, capsys):
-    laser = LaserModel(7200, -np.pi, 2.0 * np.pi / 7200, 1e5)
-    ranges_m = np.full(7200, 3.0, np.float32)
-    log, run = tmp_path / "dense.clf", tmp_path / "run"
-    write_carmen(log, (LaserScan(k, ranges_m, laser, np.array([0.1 * k, 0.0, 0.0])) for k in range(20)))
-    assert main(["info", str(log)]) == 0
-    out = capsys.readouterr().out
-    assert "7200 beams from -180.0 to 179.9 degrees (1 of 10 is mapped), range up to 100000 m" in out
-    assert out.endswith("can be mapped\n")
-    assert main(["map", str(log), "--output", str(run), "--quiet"]) == 0
 
 
 def test_names_of_a_bag_do_not_reach_the_terminal_as_they_are(tmp_path, capsys):

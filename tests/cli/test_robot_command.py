@@ -4,7 +4,6 @@ import io
 import os
 import re
 import signal
-import time
 from functools import partial
 from types import SimpleNamespace
 
@@ -19,7 +18,6 @@ from fcslam.cli.progress import ProgressDisplay
 from fcslam.errors import CloudError, InputError
 from fcslam.live.records import RobotStatus, Wiring
 from fcslam.live.robot import Robot
-from fcslam.robot.outbox import WaitingPackets
 from fcslam.ros.addresses import RosAddress
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.topics import SensorTopics
@@ -175,20 +173,6 @@ def test_a_robot_whose_place_is_in_doubt_again_does_not_say_that_a_session_begin
             )
     said = [line.split(":")[0] for line in console.file.getvalue().splitlines()]
     assert said == ["connected", "lost", "relocalized in map 0, quality 0.50", "not relocalized", "lost"]
-
-
-def test_a_robot_that_waits_for_a_dead_server_says_so_and_shows_what_waits():
-    console = Console(file=io.StringIO(), width=200)
-    with ProgressDisplay(console, interval_s=0.01) as display:
-        watch = robot_watch(display, console, total=10)
-        trouble = "http://cloud:8340: Connection refused"
-        now = RobotStatus(scans=10, keyscans=3, waiting=WaitingPackets(7, 900), trouble=trouble)
-        for _ in range(3):
-            watch(now)
-        time.sleep(0.2)
-    text = console.file.getvalue()
-    assert text.count("all scans are mapped, and packets wait for the server") == 1
-    assert re.search(r"sending 0/7, .*offline, 7 waiting", text)
 
 
 def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives():

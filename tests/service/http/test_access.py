@@ -160,16 +160,6 @@ def test_what_is_no_known_token_is_nobody(header):
     assert authenticator.who(f"Bearer {digest}") is None
 
 
-def test_health_needs_no_token_and_says_when_the_worker_is_starting_or_down(desk):
-    assert desk.ask("GET", "/healthz").status_code == 200
-    desk.state.mission.worker.is_ready = False
-    starting = desk.ask("GET", "/healthz")
-    assert (starting.status_code, starting.json()["error"][-8:]) == (503, "starting")
-    desk.state.mission.worker.pid = None
-    down = desk.ask("GET", "/healthz")
-    assert (down.status_code, down.json()["error"][-4:]) == (503, "down")
-
-
 @pytest.fixture(scope="module")
 def fuzzed(tmp_path_factory):
     with Desk(tmp_path_factory.mktemp("fuzzed") / "data", tokens=None) as desk:

@@ -12,7 +12,6 @@ from unittest.mock import ANY
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from fcslam.cloud import recognition
 from fcslam.errors import InputError
@@ -169,15 +168,6 @@ def test_viewers_see_the_fleet(shown):
     assert get(shown, "maps").json() == [one_map(["a", "b"], ["quality", "changes"])]
 
 
-def test_the_extent_of_a_map_is_that_of_its_image(shown):
-    (map_,) = get(shown, "maps").json()
-    image, description = get(shown, "maps/0.pgm").content, yaml.safe_load(get(shown, "maps/0.yaml").text)
-    width, height = map(int, image.split(maxsplit=3)[1:3])
-    (x, y, _), side = description["origin"], description["resolution"]
-    assert map_["extent"] == pytest.approx([x, y, x + width * side, y + height * side])
-    assert min(width, height) > 1
-
-
 def test_viewers_see_the_floors(desk, scripted):
     scripted()
     above = [encode(decode(data).on_floor("2")) for data in B]
@@ -212,20 +202,6 @@ def test_before_the_first_map_there_is_none(desk):
     assert get(desk, "fleet").json()["robots"] == []
     assert get(desk, "maps").json() == []
     assert desk.ask("GET", f"{API}/maps/0.png", "eye").status_code == 404
-
-
-def test_tiles_show_what_the_map_shows(shown):
-    import cv2
-
-    fine = get(shown, "maps/0/tiles/8/0/0.png")
-    assert fine.headers["content-type"] == "image/png"
-    picture = cv2.imdecode(np.frombuffer(fine.content, np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert picture.shape == (512, 512)
-    far = cv2.imdecode(
-        np.frombuffer(get(shown, "maps/0/tiles/8/5000/-5000.png").content, np.uint8), cv2.IMREAD_GRAYSCALE
-    )
-    assert set(np.unique(far)) == {205}, "where the map ends nothing is known"
-    assert shown.ask("GET", f"{API}/maps/0/tiles/9/0/0.png", "eye").status_code == 400
 
 
 @pytest.mark.parametrize("part", ["tiles/5/0/0.png", "layers/changes"])
