@@ -10,6 +10,7 @@ a new one begins with them, as after a restart. So no unmeasured motion enters a
 """
 
 import math
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -28,12 +29,15 @@ from fcslam.robot.backend_runner import Submit, inline
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.packet_queue import PacketQueue
 from fcslam.robot.predicted_motion import PredictedMotion
-from fcslam.robot.session import DeferredScans, Motion, Outcome, Session, WaitingFixes
+from fcslam.robot.session import DeferredScans, Motion, Outcome, Session
 from fcslam.robot.track import ScanTrack
 from fcslam.robot.wheel_odometry import WheelOdometry
 from fcslam.sources.contradictions import RepeatedScans
 from fcslam.sources.gate import is_clock_step
 from fcslam.wire.messages import Body, Packet
+
+MOST_FIXES = 100
+"""Fixes of satellite navigation that wait for a scan; older ones are dropped."""
 
 
 class RobotConfig(SessionConfig):
@@ -83,7 +87,7 @@ class RobotFrontend:
         self._config, self._mark = config, mark
         self._repeated = RepeatedScans()
         self._mapped = MappedScans(config.lidar.ignore, config.lidar.footprint)
-        self._fixes = WaitingFixes()
+        self._fixes: deque[GnssFix] = deque(maxlen=MOST_FIXES)
         self._deferred = DeferredScans(config.lost)
         self._before: LaserScan | None = None
         """The newest scan, mapped or not; None if the next one is of another place."""
@@ -118,7 +122,7 @@ class RobotFrontend:
             case CameraImage() if self._config.uses_images:
                 self._process_image(self.motion.place_image(record))
             case GnssFix():
-                self._fixes.add(record)
+                self._fixes.append(record)
         return self.ready()  # scans carry their odometry; images never leave the robot
 
     def ready(self, wait: bool = False) -> list[Packet]:
@@ -264,7 +268,9 @@ class RobotFrontend:
 
     def _map(self, scan: LaserScan, tracking: TrackingResult) -> None:
         self.packets.advance(scan.stamp)
-        for input in self._session.map(scan, tracking, self._fixes.until(scan.stamp)):
+        due = [fix for fix in self._fixes if fix.stamp <= scan.stamp]
+        self._fixes = deque((fix for fix in self._fixes if fix.stamp > scan.stamp), maxlen=MOST_FIXES)
+        for input in self._session.map(scan, tracking, due):
             self._submit(input)
         self.newest = NewestScan(self.scan_poses[-1], tracking.tracked, tracking.quality, is_deferred=False)
 

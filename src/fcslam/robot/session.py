@@ -5,7 +5,6 @@ a gap without odometry, it leaves a closed cabin, or the map does not explain th
 there are enough of them, they are compared with the map, and an ``Outcome`` says how to go on.
 """
 
-from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from enum import Enum, auto
@@ -37,30 +36,10 @@ from fcslam.robot.wheel_odometry import WheelOdometry, moving_on
 
 LATE_S = 0.5
 """Largest time between a fix and the scan whose pose it measures."""
-MOST_FIXES = 100
-"""Fixes that wait for a scan; older ones are dropped."""
 
 
 Motion = WheelOdometry | PredictedMotion
 """How a robot moves up to each scan and during it."""
-
-
-class WaitingFixes:
-    """Fixes of satellite navigation that wait for the next scan."""
-
-    def __init__(self) -> None:
-        self._fixes: deque[GnssFix] = deque(maxlen=MOST_FIXES)
-
-    def add(self, fix: GnssFix) -> None:
-        """Add the next fix."""
-        self._fixes.append(fix)
-
-    def until(self, stamp: float) -> list[GnssFix]:
-        """Take the fixes up to a scan at ``stamp``, seconds."""
-        due = [fix for fix in self._fixes if fix.stamp <= stamp]
-        if due:
-            self._fixes = deque((fix for fix in self._fixes if fix.stamp > stamp), maxlen=MOST_FIXES)
-        return due
 
 
 class Session:
