@@ -182,17 +182,6 @@ def test_a_worker_that_ends_is_told_once_and_the_robot_goes_on(scans, caplog):
     assert len(caplog.records) == len(events) <= 2
 
 
-def test_invalid_ranges_are_no_points(robot, scans):
-    clean = RobotFrontend("anna", fcslam.MissionConfig().robot)
-    for scan in scans:
-        clean.process(scan)
-        ranges = np.array(scan.ranges_m)
-        for number, invalid in enumerate((math.nan, -1.0, math.inf, -math.inf)):
-            ranges[number::8] = invalid
-        pose = robot.add_scan(ranges.tolist(), scan.stamp, tuple(scan.T_odom_base))
-    assert np.allclose(pose.T_map_base, clean.scan_poses.T_odom_base()[-1], atol=0.05)
-
-
 def test_without_odometry_scan_matching_alone_gives_the_motion(scans):
     events = []
     with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(SameThread()), on_event=events.append) as blind:
