@@ -20,7 +20,7 @@ from fcslam.metrics.closures import (
     precision,
 )
 from fcslam.metrics.relations import PoseTable, motion_errors
-from fcslam.records import PLACE_CHANNELS, Channel, ClosureStatus, FloatArray
+from fcslam.records import PLACE_CHANNELS, Channel, ClosureStatus
 from fcslam.runs import Run
 
 STAGES: Mapping[ClosureStatus, frozenset[ClosureStatus]] = {
@@ -99,67 +99,39 @@ FleetClosures = Mapping[tuple[ClosureScope, ClosureStatus, str], FleetClosureSco
 
 def score_closures(run: Run, known: KnownPoses) -> FleetClosures:
     """Score all sets of closures. A closure is not covered if the true pose of an end is unknown."""
-    judged, sets = _judge(run, known), closure_sets(run)
-    scores = {}
-    for within in ClosureScope:
-        across = within is ClosureScope.FLEET
-        revisits = find_revisits(known.truth, across)
-        alike = find_revisits(known.truth, across, LIKE_HEADING_DEG)
-        for status in STAGES:
-            for name, channels in CHANNELS.items():
-                scores[within, status, name] = judged.score(sets[within, status], channels, revisits, alike)
-    return MappingProxyType(scores)
-
-
-@dataclass(frozen=True, slots=True)
-class _Judged:
-    """All closures with their errors; rows are those of the known poses."""
-
-    truth: PoseTable
-    pairs: Rows
-    """Shape (K, 2)."""
-    errors: ClosureErrors
-    similarity: FloatArray
-    """Shape (K,)."""
-    of_channel: Mapping[Channel, Mask]
-    """Shape (K,) each."""
-
-    def score(
-        self, stage: Mask, channels: frozenset[Channel], revisits: Revisits, alike: Revisits
-    ) -> FleetClosureScore:
-        """Score the closures of some channels that ``stage``, shape (K,), selects."""
-        sets = [stage & self.of_channel[channel] for channel in channels]
-        members: Mask = np.logical_or.reduce(sets)
-        surest: Mask = np.logical_or.reduce([self._at_full_precision(channel_set) for channel_set in sets])
-        return FleetClosureScore(
-            precision(self.errors, members),
-            self._recall(members, revisits),
-            self._recall(members, alike),
-            self._recall(surest, revisits),
-        )
-
-    def _recall(self, members: Mask, revisits: Revisits) -> Recall:
-        correct = self.pairs[members & self.errors.correct]
-        return revisits.recall(correct, self.truth)
-
-    def _at_full_precision(self, members: Mask) -> Mask:
-        """Members (K,) that are more similar than every wrong member."""
-        wrong = members & self.errors.covered & ~self.errors.correct
-        surer: Mask = members & (self.similarity > np.max(self.similarity[wrong], initial=-np.inf))
-        return surer
-
-
-def _judge(run: Run, known: KnownPoses) -> _Judged:
-    truth = known.truth
-    pairs = closure_rows(run, truth)
+    truth, sets, pairs = known.truth, closure_sets(run), closure_rows(run, known.truth)
     T_i_j = np.array([closure.T_i_j for closure in run.closures]).reshape(-1, 3)
     true, is_known = np.full_like(T_i_j, np.nan), (pairs >= 0).all(axis=1)
     first, second = pairs[is_known].T
     true[is_known] = se2.between(truth.T_map_base[first], truth.T_map_base[second])
-    return _Judged(
-        truth,
-        pairs,
-        ClosureErrors(*motion_errors(true, T_i_j)),
-        np.array([closure.similarity for closure in run.closures]),
-        {channel: np.array([c.channel is channel for c in run.closures], dtype=np.bool_) for channel in PLACE_CHANNELS},
-    )
+    errors = ClosureErrors(*motion_errors(true, T_i_j))
+    similarity = np.array([closure.similarity for closure in run.closures])
+    of_channel = {
+        channel: np.array([c.channel is channel for c in run.closures], dtype=np.bool_) for channel in PLACE_CHANNELS
+    }
+
+    def at_full_precision(members: Mask) -> Mask:
+        """Members (K,) that are more similar than every wrong member."""
+        wrong = members & errors.covered & ~errors.correct
+        surer: Mask = members & (similarity > np.max(similarity[wrong], initial=-np.inf))
+        return surer
+
+    def recall(members: Mask, revisits: Revisits) -> Recall:
+        return revisits.recall(pairs[members & errors.correct], truth)
+
+    scores = {}
+    for within in ClosureScope:
+        across = within is ClosureScope.FLEET
+        revisits, alike = find_revisits(truth, across), find_revisits(truth, across, LIKE_HEADING_DEG)
+        for status in STAGES:
+            for name, channels in CHANNELS.items():
+                by_channel = [sets[within, status] & of_channel[channel] for channel in channels]
+                members: Mask = np.logical_or.reduce(by_channel)
+                surest: Mask = np.logical_or.reduce([at_full_precision(each) for each in by_channel])
+                scores[within, status, name] = FleetClosureScore(
+                    precision(errors, members),
+                    recall(members, revisits),
+                    recall(members, alike),
+                    recall(surest, revisits),
+                )
+    return MappingProxyType(scores)
