@@ -150,25 +150,22 @@ def core(tmp_path):
     return fcslam_
 
 
-def test_a_lidar_is_mapped_and_shown_without_any_extra(core, tmp_path):
-    for words in (
-        ("map", LOGS / "anna.clf.xz", "-o", tmp_path / "run", "-q"),
-        ("show", tmp_path / "run", "--html", tmp_path / "run.html"),
-    ):
-        done = core(*words)
-        assert (done.returncode, done.stderr) == (0, "")
-    assert "<html" in (tmp_path / "run.html").read_text(encoding="utf-8")
+def test_a_lidar_is_mapped_without_any_extra(core, tmp_path):
+    done = core("map", LOGS / "anna.clf.xz", "-o", tmp_path / "run", "-q")
+    assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "run" / "map.png").stat().st_size > 1000
 
 
 def test_a_missing_extra_is_named_in_one_line(core, tmp_path):
     cv2.imwrite(str(tmp_path / "image.png"), np.random.default_rng(1).integers(0, 255, (96, 96), np.uint8))
-    served, described = (
+    served, shown, described = (
         core("serve", "--data", tmp_path / "data"),
+        core("show", tmp_path / "run", "--html", tmp_path / "run.html"),
         core("tools", "extract", tmp_path, "-o", "x"),
     )
-    assert [served.returncode, described.returncode] == [2, 2]
-    assert re.fullmatch(r"fcslam: this needs \w+; install it: pip install 'fcslam\[service\]'\n", served.stderr)
+    assert [served.returncode, shown.returncode, described.returncode] == [2, 2, 2]
+    for done in (served, shown):
+        assert re.fullmatch(r"fcslam: this needs \w+; install it: pip install 'fcslam\[service\]'\n", done.stderr)
     assert re.fullmatch(
         r"fcslam: describing camera images needs ONNX Runtime; install it: pip install 'fcslam\[camera\]'.*\n",
         described.stderr,

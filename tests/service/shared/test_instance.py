@@ -101,6 +101,17 @@ def test_a_lease_ends_by_the_servers_clock_and_one_that_is_renewed_does_not(regi
     assert registry.renew([(kept, True), (lost, True)]) == {kept}
 
 
+def test_the_clock_of_an_instance_may_be_wrong_by_minutes(registry, postgres, monkeypatch):
+    number = wanted(registry, postgres, "timed")
+    (lease,) = registry.claim(1)
+    for wrong_s in (-600.0, 600.0):
+        now = time.time() + wrong_s
+        monkeypatch.setattr(time, "time", lambda now=now: now)
+        assert Registry(postgres, "wrong", "process of wrong").claim(9) == []
+        assert registry.renew([(lease, True)]) == {lease}
+        MissionStore(MissionTables(postgres, number, lease)).progress(1, [])
+
+
 def test_after_the_store_was_gone_the_others_may_renew_before_anybody_claims(registry, postgres):
     wanted(registry, postgres, "m")
     (lease,) = registry.claim(1)
