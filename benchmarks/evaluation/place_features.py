@@ -404,7 +404,7 @@ def planar_inliers(a: PlaceFeatures, b: PlaceFeatures) -> int:
     """Number of inliers of the best rigid motion between two LiDAR places."""
     matches = mutual_matches(a.descriptors, b.descriptors, LARGEST_HAMMING)
     found = rigid_hypotheses(a.positions, b.positions, matches)
-    return found[0].inlier_count if found else 0
+    return len(found[0][1]) if found else 0
 
 
 def _corrected(packets: list[Packet]) -> FloatArray:

@@ -43,19 +43,9 @@ KEYPOINT_SIGMA_M = 0.1
 """Standard deviation of the position of an image keypoint, metres."""
 
 
-@dataclass(frozen=True, slots=True)
-class Hypothesis:
-    """A rigid motion and its inliers."""
-
-    T_a_b: FloatArray
-    """Shape (3,): x, y in metres and theta in radians; takes coordinates of place b to place a."""
-    inliers: NDArray[np.int64]
-    """Shape (K,): rows of ``matches.pairs``, ascending."""
-
-    @property
-    def inlier_count(self) -> int:
-        """Number of inliers."""
-        return len(self.inliers)
+Hypothesis = tuple[FloatArray, NDArray[np.int64]]
+"""A rigid motion (3,), x, y in metres and theta in radians, which takes coordinates of place b to place a; and its
+inliers, rows of ``matches.pairs``, shape (K,), ascending."""
 
 
 def rigid_hypotheses(
@@ -75,8 +65,7 @@ def rigid_hypotheses(
     seeds = np.argsort(matches.distances, kind="stable")[:SEEDS]
     poses, agreeing = _best(a, b, seeds)
     return [
-        Hypothesis(frozen(pose), frozen(np.flatnonzero(agrees), np.int64))
-        for pose, agrees in zip(poses, agreeing, strict=True)
+        (frozen(pose), frozen(np.flatnonzero(agrees), np.int64)) for pose, agrees in zip(poses, agreeing, strict=True)
     ]
 
 
@@ -238,7 +227,11 @@ def propose_motions(a: Place, b: Place) -> list[Motion]:
         matches = level_matches(a.keypoints, b.keypoints, matches)
     proposed = rigid_hypotheses(a.keypoints[:, :2], b.keypoints[:, :2], matches)
     share = len(matches.pairs) / max(1, min(len(a.descriptors), len(b.descriptors)))
-    return [Motion(h.T_a_b, _information(b, h, matches), share) for h in proposed if h.inlier_count >= LEAST_INLIERS]
+    return [
+        Motion(T_a_b, _information(b, T_a_b, matches.pairs[inliers, 1]), share)
+        for T_a_b, inliers in proposed
+        if len(inliers) >= LEAST_INLIERS
+    ]
 
 
 def level_matches(a: NDArray[np.floating], b: NDArray[np.floating], matches: Matches) -> Matches:
@@ -247,12 +240,12 @@ def level_matches(a: NDArray[np.floating], b: NDArray[np.floating], matches: Mat
     return Matches(matches.pairs[level], matches.distances[level])
 
 
-def _information(b: Place, hypothesis: Hypothesis, matches: Matches) -> FloatArray:
-    """Information of the motion from the positions of its inliers (Gauss-Newton normal matrix)."""
+def _information(b: Place, T_a_b: FloatArray, rows: NDArray[np.integer]) -> FloatArray:
+    """Information of the motion from the positions of its inliers, ``rows`` of b (Gauss-Newton normal matrix)."""
     if b.channel is not Channel.CAMERA:
         return np.zeros((3, 3))
-    inliers = b.keypoints[matches.pairs[hypothesis.inliers, 1], :2].astype(np.float64)
-    turned = se2.transform((0.0, 0.0, hypothesis.T_a_b[2]), inliers)
+    inliers = b.keypoints[rows, :2].astype(np.float64)
+    turned = se2.transform((0.0, 0.0, T_a_b[2]), inliers)
     jacobian = np.zeros((len(turned), 2, 3))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
     jacobian[:, 0, 2], jacobian[:, 1, 2] = -turned[:, 1], turned[:, 0]

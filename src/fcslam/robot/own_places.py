@@ -61,4 +61,4 @@ class OwnPlaces:
         of_a, of_b = self.features(a), self.features(b)
         matches = mutual_matches(of_a.descriptors, of_b.descriptors, LARGEST_HAMMING)
         proposed = rigid_hypotheses(of_a.keypoints_m, of_b.keypoints_m, matches)
-        return [hypothesis.T_a_b for hypothesis in proposed if hypothesis.inlier_count >= LEAST_INLIERS]
+        return [T_a_b for T_a_b, inliers in proposed if len(inliers) >= LEAST_INLIERS]

@@ -127,4 +127,4 @@ def inliers(a: Keyframe, b: Keyframe) -> int:
     codes_a, codes_b = (each.features.descriptors[each.placed] for each in (a, b))
     matches = level_matches(positions_a, positions_b, mutual_matches(codes_a, codes_b, LARGEST_HAMMING))
     flat = positions_a[:, :2].astype(np.float32), positions_b[:, :2].astype(np.float32)
-    return max((each.inlier_count for each in rigid_hypotheses(*flat, matches)), default=0)
+    return max((len(inliers) for _, inliers in rigid_hypotheses(*flat, matches)), default=0)
