@@ -97,7 +97,7 @@ def camera_places(folder):
 def test_a_mission_goes_through_rounds_release_adoption_and_describing_again(tmp_path):
     require_gl()
     settings = SimulationSettings(
-        robots=3, path_length_m=30.0, lighting=(Lighting.DAY, Lighting.EVENING),
+        robots=3, path_length_m=40.0, lighting=(Lighting.DAY, Lighting.EVENING),
         lidar=LidarSettings(rate_hz=5.0), camera=CameraSettings(rate_hz=3.0),
     )  # fmt: skip
     prepare_fleet_folder(tmp_path / "sim", settings, 5)

@@ -56,13 +56,16 @@ def prepare_initial_weights(
 
 
 def drawn_images() -> list[GreyImage]:
-    """Dead leaves: discs that hide one another, whose statistics resemble those of photographs (Lee et al. 2001)."""
+    """Rectangles that hide one another, with shades near that of a plain background, as of a wall."""
     rng, pictures = np.random.default_rng(2), []
     for _ in range(STATISTICS_IMAGES):
-        picture = np.full((240, 240), 128, np.uint8)
-        for x, y, shade in rng.integers(0, (240, 240, 256), (300, 3)).tolist():
-            cv2.circle(picture, (x, y), int(3.0 / rng.uniform(0.06, 1.0)), shade, -1)
-        pictures.append(np.asarray(cv2.GaussianBlur(picture, (3, 3), 0), np.uint8))
+        level = int(rng.integers(20, 236))
+        picture = np.full((240, 240), level, np.uint8)
+        for x, y in rng.integers(0, 240, (40, 2)).tolist():
+            shade = int(np.clip(level + rng.integers(-80, 81), 0, 255))
+            width, height = (3.0 / rng.uniform(0.03, 1.0, 2)).astype(int).tolist()
+            cv2.rectangle(picture, (x, y), (x + width, y + height), shade, -1)
+        pictures.append(np.asarray(cv2.GaussianBlur(picture, (5, 5), 0), np.uint8))
     return pictures
 
 
