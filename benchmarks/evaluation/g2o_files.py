@@ -67,7 +67,7 @@ def read_g2o(path: Path) -> G2oGraph:
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
-        with open_unpacked(path, by_name=True) as file:
+        with open_unpacked(path) as file:
             for number, line in enumerate(iter(lambda: file.readline(_MAXIMUM_LINE + 1), b""), start=1):
                 if len(line) > _MAXIMUM_LINE:
                     raise InputError(f"{path}: line {number}: too long for a pose graph")

@@ -269,7 +269,7 @@ def federated(_: Path) -> Iterator[Target]:
     replies = [
         write_reply(TrainingReply(robot, "light-1", weights, {"detector": 0.5})) for robot, weights in moved.items()
     ]
-    asked = write_request(TrainingRequest(True, sent, "light-1", 0, "run", "images", FederatedSettings()))
+    asked = write_request(TrainingRequest(True, sent, "light-1", 0, "run", FederatedSettings()))
 
     def one(rng: random.Random) -> bool:
         data = mutate(rng, rng.choice((asked, *replies)), replies)
