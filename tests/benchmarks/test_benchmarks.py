@@ -59,14 +59,6 @@ def test_imports_without_running(path, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_without_recordings_one_line_and_success(monkeypatch, capsys):
-    monkeypatch.delenv("FCSLAM_DATA", raising=False)
-    with pytest.raises(SystemExit) as ended:
-        common.recordings("slam-benchmark/intel.clf.xz")
-    assert ended.value.code == 0
-    assert capsys.readouterr().out == "skipped: needs recordings; set FCSLAM_DATA to their folder\n"
-
-
 def test_missing_recordings_fail_with_their_names(monkeypatch, tmp_path):
     monkeypatch.setenv("FCSLAM_DATA", str(tmp_path))
     with pytest.raises(SystemExit, match=r"intel\.clf\.xz missing"):
@@ -94,21 +86,6 @@ def test_a_report_is_two_files_that_say_the_same(tmp_path, monkeypatch, capsys):
     assert "- date: 2026-11-05" in markdown
     assert markdown in capsys.readouterr().out
     assert common.figures(tmp_path / "sample.csv", "Numbers") == [{"what": "a", "m": "1.23456"}, {"what": "b", "m": ""}]
-
-
-@pytest.mark.slow
-def test_a_picture_lies_beside_the_report(tmp_path, monkeypatch, capsys):
-    from matplotlib.figure import Figure
-
-    monkeypatch.setattr(sys, "argv", ["sample.py"])
-    chosen = common.options("Sample.").parse_args(["--results", str(tmp_path / "results")])
-    report = common.Report("benchmarks/sample.py", "Sample.", chosen)
-    figure = Figure()
-    figure.subplots().plot([1, 2])
-    report.picture("A line", figure)
-    report.write()
-    assert (tmp_path / "results" / "sample.png").read_bytes().startswith(b"\x89PNG")
-    assert "![A line](sample.png)" in capsys.readouterr().out
 
 
 @pytest.mark.slow

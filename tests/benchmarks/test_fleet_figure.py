@@ -7,8 +7,6 @@ from evaluation.fleet_figure import (
     Chart,
     FleetCharts,
     MatchedPlaces,
-    draw_figure,
-    spread,
     write_figure,
 )
 
@@ -52,47 +50,6 @@ def charts():
         Chart(hall(), trajectories),
         [match(0, 1), match(1, 2), match(0, 2), match(0, 1, Channel.CAMERA)],
     )
-
-
-def sheet(charts):
-    (axes,) = draw_figure(charts).axes
-    return axes
-
-
-def match_lines(charts):
-    return [line for line in sheet(charts).lines if line.get_gid() == "match"]
-
-
-def pixel(axes, panel, x, y):
-    """Where the image of a hall, which fills the unit square before its own transform, says that a point is."""
-    transform = axes.images[panel].get_transform() - axes.transData
-    return transform.transform(np.array((x, y)) / SIZE_M)
-
-
-def test_every_way_lies_on_its_map(charts):
-    axes = sheet(charts)
-    assert len(axes.images) == len(ROBOTS) + 2
-    for k, color in enumerate(palette.ROBOTS[: len(ROBOTS)]):
-        drawn = [line.get_xydata() for line in axes.lines if line.get_color() == f"#{color:06X}"]
-        drawn = [line for line in drawn if len(line) == 2]
-        own, fused, building = drawn
-        for line, panel, y in ((own, k, 1.0), (fused, 3, 1.0 + 0.5 * k), (building, 4, 1.0 + 0.5 * k)):
-            np.testing.assert_allclose(line, [pixel(axes, panel, x, y) for x in (1.0, 5.0)])
-
-
-def test_a_line_leads_from_place_to_place_in_the_color_of_its_channel(charts):
-    axes = sheet(charts)
-    lines = match_lines(charts)
-    assert [line.get_color() for line in lines] == [LIDAR, LIDAR, LIDAR, CAMERA]
-    for line, (i, j) in zip(lines, ((0, 1), (1, 2), (0, 2), (0, 1)), strict=True):
-        ends = line.get_xydata()[[0, -1]]
-        np.testing.assert_allclose(ends, [pixel(axes, i, 1.0, 1.0), pixel(axes, j, 2.0, 2.0)])
-
-
-def test_few_of_many_matches_lie_far_apart():
-    crowd = [match(0, 1, x=1.0 + 0.001 * k) for k in range(50)] + [match(0, 1, x=4.0), match(0, 2, x=4.0)]
-    assert [(m.robot_j, float(m.xy_i[0])) for m in spread(crowd, 2)] == [("b", 1.0), ("b", 4.0), ("c", 4.0)]
-    assert len(spread(crowd, 1000)) == len(crowd)
 
 
 def test_the_same_charts_make_the_same_file(charts, tmp_path):

@@ -2,7 +2,6 @@
 
 import re
 
-import cv2
 import numpy as np
 import pytest
 from evaluation.place_sets import read_place_set
@@ -83,41 +82,6 @@ def test_what_stands_before_the_wall_is_not_the_wall():
     assert view_overlap(depths, camera_over_a_wall(0.0), PLAIN)[0, 1] == 0.0
     depths[1] = 0.95
     assert view_overlap(depths, camera_over_a_wall(0.0), PLAIN)[0, 1] > 0.8
-
-
-def test_overlap_through_a_real_lens_is_that_of_opencv():
-    rng = np.random.default_rng(3)
-    camera = DepthCamera(np.array([258.0, 258.0, 159.3, 127.6]) / 2, np.array([0.26, -0.95, -0.005, 0.003, 1.16]))
-    depths = rng.uniform(1.9, 2.1, (2, 120, 160))
-    depths[rng.random(depths.shape) < 0.2] = 0.0
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[1, :3, :3], poses[1, :3, 3] = cv2.Rodrigues(np.array([0.02, 0.2, 0.05]))[0], [0.1, -0.05, 0.02]
-    overlap = view_overlap(depths, poses, camera)
-    assert overlap[0, 1] == pytest.approx(min(by_opencv(depths, poses, camera, a, 1 - a) for a in (0, 1)), abs=0.01)
-    assert 0.3 < overlap[0, 1] < 0.95
-
-
-def by_opencv(depths, poses, camera, a, b):
-    """The same share with OpenCV's projection, pixel by pixel."""
-    fx, fy, cx, cy = camera.intrinsics
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    judged = again = 0
-    T_b_a = np.linalg.inv(poses[b]) @ poses[a]
-    for v in range(0, 120, 8):
-        for u in range(0, 160, 8):
-            depth = depths[a, v, u]
-            if depth == 0.0:
-                continue
-            ray = cv2.undistortPoints(np.array([[[u, v]]], float), K, camera.distortion)[0, 0]
-            point = T_b_a[:3, :3] @ (depth * np.array([*ray, 1.0])) + T_b_a[:3, 3]
-            pixel = cv2.projectPoints(point[None], np.zeros(3), np.zeros(3), K, camera.distortion)[0][0, 0]
-            column, row = np.floor(pixel + 0.5).astype(int)
-            inside = 0 <= column < 160 and 0 <= row < 120
-            if inside and depths[b, row, column] == 0.0:
-                continue
-            judged += 1
-            again += inside and abs(depths[b, row, column] - point[2]) <= 0.1 * point[2]
-    return again / judged
 
 
 def sequence(folder, shifts_m, seconds=1.0):

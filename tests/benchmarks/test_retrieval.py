@@ -117,23 +117,6 @@ def test_ignored_pairs_and_the_scale_count_for_nothing(question, random):
     np.testing.assert_array_equal(mismatches(similarity, truth), mismatches(changed, truth))
 
 
-def test_queries_without_a_match_count_against_precision_only():
-    similarity = np.array([[0.9, 0.1], [0.2, 0.95]])
-    truth = PairTruth(np.array([[True, False], [False, False]]), np.array([[False, True], [True, True]]))
-    assert recall_at(similarity, truth, 1).tolist() == [1.0]
-    curve = single_best(similarity, truth).curve()
-    assert curve.precision.tolist() == [0.0, 0.5]
-    assert curve.recall.tolist() == [0.0, 1.0]
-
-
-def test_nothing_to_find_is_no_number():
-    truth = PairTruth(np.zeros((1, 2), bool), np.ones((1, 2), bool))
-    curve = single_best(np.ones((1, 2)), truth).curve()
-    assert np.isnan(curve.average_precision)
-    assert np.isnan(curve.recall_at_full_precision)
-    assert len(recall_at(np.ones((1, 2)), truth, 1)) == 0
-
-
 def test_a_pair_cannot_be_both():
     both = np.ones((1, 1), bool)
     with pytest.raises(ValueError, match="match and be different"):

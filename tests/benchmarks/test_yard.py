@@ -4,20 +4,15 @@ import numpy as np
 import pytest
 from worlds.outdoor_rays import LASER_HEIGHT_M, OutdoorRayCaster
 from worlds.walk import draw_starts, plan_walk
-from worlds.yard import Yard, draw_yard, move_cars
+from worlds.yard import draw_yard
 from worlds.yard_plan import CELL_M, Terrain, YardKind, YardPlan
 
 from fcslam.lab.simulation.drivable_space import ROBOT_RADIUS_M
 from fcslam.lab.simulation.floorplan import Piece, disc, rectangle, segments_of
-from fcslam.lab.simulation.noise import LidarSettings
-from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.records import LaserModel
 from tests.lab.simulation.driving import distances, drive
 
 pytestmark = pytest.mark.slow
-
-SICK = LidarSettings(beams=181, field_of_view_rad=np.pi, max_range_m=81.9, rate_hz=0.5)
-TINY = SimulationSettings(robots=2, path_length_m=60.0, camera=None, lidar=SICK)
 HERE = np.array([20.0, 20.0, 0.0])
 AHEAD = LaserModel(3, -0.001, 0.001, 30.0)
 
@@ -53,20 +48,6 @@ def ranges(robot):
     return np.array([scan.ranges_m for scan in robot.scans()])
 
 
-def test_a_further_robot_changes_nothing_for_the_others():
-    few, more = (simulate_fleet(TINY.model_copy(update={"robots": count}), 1, Yard()) for count in (2, 3))
-    for a, b in zip(few.robots, more.robots[:2], strict=True):
-        np.testing.assert_array_equal(a.T_odom_base, b.T_odom_base)
-        np.testing.assert_array_equal(ranges(a), ranges(b))
-
-
-def test_ranges_stay_below_the_maximum_and_some_beams_return_nothing():
-    found = ranges(simulate_fleet(TINY, 3, Yard()).robots[0])
-    assert found.min() > 0.0
-    assert found.max() <= np.float32(81.9)
-    assert 0.4 < np.mean(found < 80.0) < 0.95
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_everything_stands_in_the_yard_and_clear_of_its_ways(seed):
     plan = draw_yard(np.random.default_rng(seed))
@@ -93,15 +74,6 @@ def test_a_walk_touches_nothing_has_its_length_and_comes_home(seed):
     away_m = np.linalg.norm(poses[:, :2] - start, axis=1)
     assert away_m.max() > 20.0
     assert away_m[len(away_m) // 2 :].min() < 3.0
-
-
-def test_some_cars_drive_away():
-    plan = draw_yard(np.random.default_rng(2))
-    moved = move_cars(plan, 0.5, np.random.default_rng(3))
-    cars, fewer = (sum(piece.kind is YardKind.CAR for piece in p.pieces) for p in (plan, moved))
-    assert 0 < fewer < cars
-    assert len(plan.pieces) - len(moved.pieces) == cars - fewer
-    assert len(moved.segments) < len(plan.segments)
 
 
 def test_a_trunk_is_met_at_its_bark():

@@ -3,16 +3,14 @@
 import os
 import subprocess
 import sys
-import types
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pydantic import Field
 
 from fcslam import __version__
 from fcslam.cli import BAD_INPUT, main
-from fcslam.config import Settings, load
+from fcslam.config import load
 from fcslam.lab.presets import Preset
 from fcslam.mission.mission import MissionConfig
 from fcslam.runs import RobotTrajectory, Run
@@ -35,26 +33,10 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"fcslam {__version__}\n"
 
 
-def test_arguments_are_explained(capsys):
-    main(["evaluate", "relations", "--help"])
-    assert "Run folder to measure." in capsys.readouterr().out
-
-
 def test_no_command_is_help(capsys):
     main([])
     shown = capsys.readouterr()
     assert "evaluate" in shown.out + shown.err
-
-
-def test_config_dump_prints_the_mission_configuration(capsys, monkeypatch):
-    class MissionConfig(Settings):
-        seed: int = Field(default=7, description="of everything random")
-
-    mission = types.ModuleType("fcslam.mission.mission")
-    mission.MissionConfig = MissionConfig
-    monkeypatch.setitem(sys.modules, "fcslam.mission.mission", mission)
-    assert main(["tools", "config"]) == 0
-    assert capsys.readouterr().out == "# of everything random\nseed: 7\n"
 
 
 def test_config_dump_of_a_preset_is_a_configuration_file(capsys, tmp_path):

@@ -4,7 +4,6 @@ import csv
 import io
 import sys
 from contextlib import redirect_stderr, redirect_stdout
-from pathlib import Path
 
 import pytest
 
@@ -103,11 +102,6 @@ def test_without_the_simulator_one_line_says_what_to_install(tmp_path, capsys, m
     monkeypatch.setitem(sys.modules, "mujoco", None)
     assert "pip install 'fcslam[sim]'" in refused(tmp_path / "demo", capsys, "--no-camera")
     assert not (tmp_path / "demo").exists()
-
-
-def test_make_installs_the_packages_that_the_message_names():
-    makefile = (Path(__file__).parents[2] / "Makefile").read_text()
-    assert f"GL_PACKAGES := {engine._PACKAGES}\n" in makefile
 
 
 @pytest.mark.system

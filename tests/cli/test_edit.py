@@ -242,15 +242,6 @@ def test_a_map_aligns_to_its_walls(run, drawn):
         assert np.sin(2.0 * off) == pytest.approx(0.0, abs=0.02), "the walls of the building run along its axes"
 
 
-def test_a_map_is_placed_by_points_of_a_floor_plan(run, capsys):
-    assert edit(run, "place", "--match", "1,0=10,5", "--match", "3,0=10,7.2") == 0
-    assert "the points fit to 0.100 m" in capsys.readouterr().err
-    (placed,) = read_mission(run).edits
-    trajectory = open_run(run).trajectories[placed.content.session]
-    T_map_base = trajectory.T_map_base[np.abs(trajectory.stamps - placed.content.stamp).argmin()]
-    assert placed.content.pose == pytest.approx(se2.compose(np.array((10.0, 4.1, np.pi / 2)), T_map_base), abs=1e-6)
-
-
 def test_the_list_says_who_did_what_and_what_was_undone(run, capsys):
     assert main(["edit", "list", str(run)]) == 0
     assert capsys.readouterr().out == "no edits\n"
@@ -321,17 +312,6 @@ def arguments_of(argument, names):
     for placeholder, name in names.items():
         argument = argument.replace(placeholder, name)
     return argument
-
-
-def test_an_undo_of_an_undo_is_refused(run, capsys):
-    first, second = list(open_run(run).trajectories)[:2]
-    assert [edit(run, "veto", first, second), edit(run, "undo", 1)] == [0, 0]
-    mission = (run / "mission.fcslam").read_bytes()
-    for number, reason in ((1, "edit 1 was undone before, by edit 2"), (2, "edit 2 undoes edit 1")):
-        capsys.readouterr()
-        assert edit(run, "undo", number) == 2
-        assert reason in capsys.readouterr().err
-    assert (run / "mission.fcslam").read_bytes() == mission
 
 
 def test_what_is_drawn_needs_the_run_folder(run, tmp_path, capsys):

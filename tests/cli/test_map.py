@@ -13,10 +13,7 @@ import yaml
 from fcslam.cli import main
 from fcslam.cli import map as mapping
 from fcslam.config import dump
-from fcslam.geometry import se2
 from fcslam.mission.mission import MissionConfig
-from fcslam.runs import read_tum
-from tests.small_fleet import truth_at
 from tests.sources.carmen_text import drive, flaser, odom, pose_at, save
 
 pytestmark = pytest.mark.slow
@@ -82,20 +79,6 @@ def test_the_map_can_be_looked_at_and_served(run):
     assert set(np.unique(grid)) == {0, 205, 254}
     assert (grid == 254).sum() * meta["resolution"] ** 2 > 50.0, "square metres of free floor"
     assert cv2.imread(str(run / "map.png")).shape[2] == 3
-
-
-def test_all_robots_lie_in_one_map_to_five_centimetres(run, drawn):
-    assert set(maps_of(run).values()) == {0}
-    first, *others = drawn.robots
-    stamps, poses = read_tum(run / "trajectories" / f"{first.name}.tum")
-    true = truth_at(first, stamps)
-    for robot in others:
-        other_stamps, other_poses = read_tum(run / "trajectories" / f"{robot.name}.tum")
-        other_true = truth_at(robot, other_stamps)
-        for k in range(0, len(stamps), 10):
-            seen, expected = se2.between(poses[k], other_poses), se2.between(true[k], other_true)
-            near = np.hypot(*expected[:, :2].T) < 5.0
-            assert np.hypot(*(seen - expected)[near, :2].T).max(initial=0.0) < 0.05
 
 
 def test_one_recording_split_into_robots(logs, tmp_path, drawn):

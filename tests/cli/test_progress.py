@@ -39,14 +39,6 @@ def test_bar_count_and_time_fit_80_columns():
     assert "…" in text
 
 
-def test_long_names_leave_room():
-    terminal = console(terminal=True, color_system=None)
-    with ProgressDisplay(terminal) as display:
-        display.show("a stage with a name that nobody should give it", 12345, 123456, DETAILS)
-        text = "".join(s.text for s in terminal.render_lines(display._bars.get_renderable(), terminal.options)[0])
-    assert "12345/123456 0:00:00 -:--:--" in text
-
-
 def test_without_a_terminal_plain_lines_come_even_if_nothing_happens():
     pipe = console()
     with ProgressDisplay(pipe, "output: runs/now", interval_s=0.02) as display:
@@ -86,10 +78,3 @@ def test_quiet_is_silent_on_a_terminal_and_elsewhere():
             display.show("mapping", 12, 40)
             time.sleep(0.05)
         assert shown(silent) == ""
-
-
-def test_nothing_is_shown_before_the_first_stage():
-    pipe = console()
-    with ProgressDisplay(pipe, "output: runs/now", interval_s=0.01):
-        time.sleep(0.05)
-    assert shown(pipe) == ""

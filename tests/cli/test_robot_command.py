@@ -104,12 +104,6 @@ def test_what_is_wrong_is_one_line(log, cloud, tmp_path, capsys, arguments, reas
     assert cloud.cloud.stored == {}
 
 
-@pytest.mark.parametrize(("name", "reason"), [("r+2", "is the name of a session of 'r'"), ("r/2", "is not a name")])
-def test_a_name_that_cannot_be_used_is_one_line(log, cloud, tmp_path, capsys, name, reason):
-    assert main(["play", f"{name}={log}", "--server", cloud.url, "--state", str(tmp_path / "state")]) == 2
-    assert reason in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [

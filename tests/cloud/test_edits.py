@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fcslam.cloud.cloud import Cloud
-from fcslam.cloud.edits import check_undo, edit_json, in_force, is_removed, kind_of, read_edit
+from fcslam.cloud.edits import check_undo, edit_json, in_force, kind_of, read_edit
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
@@ -86,11 +86,6 @@ def test_in_force_is_what_nothing_undid():
     for number in (0, 1, 2, 3, 6):
         with pytest.raises(InputError):
             check_undo(edits, number)
-
-
-def test_a_removal_covers_a_robot_or_one_session():
-    assert [is_removed(name, [Removal("b")]) for name in ("a", "b", "b+1", "bb")] == [False, True, True, False]
-    assert [is_removed(name, [Removal("b", 1)]) for name in ("b", "b+1", "b+11")] == [False, True, False]
 
 
 def with_liar():

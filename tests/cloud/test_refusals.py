@@ -115,14 +115,6 @@ def test_a_robot_that_is_called_like_a_session_is_refused(scripted, reference, n
     assert fingerprint(feed(cloud, PACKETS[HALF:]).finalize()) == reference
 
 
-def test_bytes_that_are_no_packet_are_refused(scripted, reference):
-    cloud = feed(scripted(SCRIPT), PACKETS[:HALF])
-    good = encode(PACKETS[HALF])
-    for data in (b"", b"\x00" * 50, good[:-3], good + b"\x00", b"GET / HTTP/1.1\r\n"):
-        assert refusal_of(cloud, data)
-    assert fingerprint(feed(cloud, PACKETS[HALF:]).finalize()) == reference
-
-
 def test_a_keyscan_waits_for_the_motion_to_the_one_before(scripted):
     packets = stream("a", POSES, start_s=0.0)
     cloud = feed(scripted(), packets[:3])  # hello, keyscan 0, place 0
@@ -133,12 +125,6 @@ def test_a_keyscan_waits_for_the_motion_to_the_one_before(scripted):
     assert "names keyscan 1" in refusal_of(cloud, dangling)
     (robot,) = cloud.finalize().robots
     assert [k.id.number for k in robot.keyscans] == [0]
-
-
-def test_a_robot_without_a_keyscan_is_no_part_of_the_result(scripted):
-    cloud = feed(scripted(), stream("a", POSES, start_s=0.0)[:1])
-    assert refusal_of(cloud, encode(Packet("a", 0, 1, 0.0, keyscan("a", 7, 0.0))))
-    assert cloud.finalize().robots == ()
 
 
 def test_every_packet_is_acknowledged_and_a_place_may_bring_a_correction(scripted):

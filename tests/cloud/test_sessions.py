@@ -14,7 +14,7 @@ from fcslam.records import NAME, ConstraintKind, Correction, KeyscanId
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
 from tests.scripted import closures, motion, rectangle, stream
-from tests.small_fleet import feed, fingerprint, in_order, map_of
+from tests.small_fleet import feed, fingerprint, map_of
 
 POSES = rectangle(29)
 CLOSURE = ConstraintKind.CLOSURE
@@ -53,18 +53,6 @@ def test_a_session_is_to_the_cloud_what_another_robot_would_be(scripted):
 def test_without_closures_sessions_stay_apart_and_a_third_is_told_from_the_second(scripted):
     packets = [*two_starts(), *started_again(stream("a", POSES, start_s=900.0), epoch=7)]
     assert map_of(feed(scripted(), packets).finalize()) == {"a": 0, "a+1": 1, "a+7": 2}
-
-
-@pytest.mark.slow
-def test_sessions_in_any_order_of_arrival_give_the_same_result(scripted):
-    script = closures(("a", POSES), ("a+1", POSES), PAIRS)
-    expected = fingerprint(feed(scripted(script), in_order(two_starts())).finalize())
-    packets, rng = two_starts(), np.random.default_rng(5)
-    half = len(packets) // 2
-    for _ in range(3):
-        # what is scripted needs the first session's keyscans
-        shuffled = [packets[k] for k in (*rng.permutation(half), *(half + rng.permutation(half)))]
-        assert fingerprint(feed(scripted(script), shuffled).finalize()) == expected
 
 
 def test_corrections_are_addressed_to_the_robot_in_its_epoch(scripted):

@@ -11,7 +11,6 @@ from fcslam.cloud.sessions import in_session
 from fcslam.cloud.settings import FleetConfig
 from fcslam.places.matcher import MatcherConfig
 from fcslam.places.vocabulary import VocabularyConfig
-from fcslam.records import Veto
 from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import read_state, write_state
 from tests import small_fleet
@@ -72,13 +71,6 @@ def test_restarts_anywhere_change_nothing(packets, uninterrupted, tmp_path):
     assert believed(fleet) == believed(uninterrupted)
     expected = restarted(uninterrupted, packets, tmp_path / "state")
     same(fleet, expected)
-
-
-def test_a_veto_and_decisions_survive(packets, tmp_path):
-    fleet = go_on(Fleet(CONFIG, 0), packets)
-    veto = Veto(packets[0].robot, next(p.robot for p in packets if p.robot != packets[0].robot))
-    fleet.edit([veto])
-    same(restarted(fleet, packets, tmp_path / "state", [veto]), fleet)
 
 
 def test_a_log_survives_with_its_gaps_and_refusals(tmp_path):

@@ -23,7 +23,6 @@ from fcslam.records import (
     Tag,
     TagFamily,
     TagSighting,
-    Veto,
     frozen,
 )
 from fcslam.storage.state_file import read_state, write_state
@@ -153,11 +152,6 @@ def test_tags_and_their_closures_are_limited():
     often = [(tag, AT, len(LOOP)) for tag, _, _ in many[:20]]
     result = concluded([*drive("anna", LOOP, often), *drive("berta", LOOP, often)])
     assert sum(closure.i.robot != closure.j.robot for closure in result.closures) == MOST_CLOSURES
-
-
-def test_a_veto_keeps_them_apart():
-    result = concluded(two(), [Veto("anna", "berta")])
-    assert len(set(map_of(result).values())) == 2
 
 
 def test_the_result_does_not_depend_on_the_order_of_arrival():

@@ -1,7 +1,5 @@
 """The training loop: it learns, resumes as if nothing had happened, keeps what it has, and sounds its alarms."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -23,7 +21,6 @@ from fcslam.learning.trainer import (  # noqa: E402
 from fcslam.learning.training_loop import learning_rate  # noqa: E402
 from fcslam.learning.validation import collapse_warnings, validate, validation_pairs  # noqa: E402
 
-CPU_FLAGS = Path("/proc/cpuinfo")
 SMALL = TrainingSettings(steps=6, pairs=1, side_px=64)
 pytestmark = pytest.mark.usefixtures("brief_validation")
 PACE = ExecutionOptions(validate_every=100, checkpoint_every_s=0.0, log_every=1)
@@ -74,17 +71,6 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(examples, tmp_path):
     torn = resumed.train(examples, examples[:1], bits, lambda status: steps.append(status.step))
     assert steps == [4, 5, 6]
     assert torch.equal(weights(whole.train(examples, examples[:1], bits)), weights(torn))
-
-
-@pytest.mark.slow
-def test_another_seed_trains_another_network(examples, tmp_path):
-    networks = []
-    for seed in (1, 2):
-        folder = tmp_path / str(seed)
-        folder.mkdir()
-        settings = SMALL.model_copy(update={"seed": seed, "steps": 1})
-        networks.append(weights(TrainingRun(settings, folder, PACE).train(examples, examples[:1])))
-    assert not torch.equal(*networks)
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", b"PK\x03\x04"])

@@ -11,7 +11,6 @@ from fcslam.geometry import se2
 from fcslam.live.map_poses import CorrectedOdometry, MapPoses
 from fcslam.records import Correction, Keyscan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.robot.track import ScanTrack
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet
 from tests.wire.examples import CORRECTION
@@ -40,22 +39,6 @@ def test_odom_is_where_the_cloud_thinks_it_is(driven):
     last = next(number for number, pose in enumerate(track) if pose.stamp == keyscans[-1].stamp)
     assert np.allclose(newest.T_map_base(track.T_odom_base()[last]), mapped.T_map_base[-1], atol=0.02)
     assert np.allclose(track.T_odom_base()[0], 0.0)
-
-
-def test_a_track_composes_motions_and_offsets(driven):
-    track, T_odom_keyscan, expected = ScanTrack(), [np.zeros(3)], []
-    for pose in driven[1]:
-        while pose.keyscan >= len(T_odom_keyscan):
-            motion = np.array([0.25, 0.0, 0.1])
-            track.extend(motion)
-            T_odom_keyscan.append(se2.compose(T_odom_keyscan[-1], motion))
-        track.add(pose)
-        expected.append(se2.compose(T_odom_keyscan[-1], pose.T_keyscan_base))
-    assert len(T_odom_keyscan) > 3
-    assert np.allclose(track.T_odom_base(), expected, atol=1e-12)
-    assert np.array_equal(track.stamps, [pose.stamp for pose in track])
-    assert np.array_equal(track.keyscans, [pose.keyscan for pose in track])
-    assert np.array_equal(track.T_keyscan_base, [pose.T_keyscan_base for pose in track])
 
 
 def test_a_correction_replaces_the_last_and_moves_every_pose(driven):

@@ -245,18 +245,6 @@ def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
     assert stamps[0] > moment, "where it was before is not known"
 
 
-def test_a_robot_that_is_turned_away_says_so_and_keeps_everything(scans, alone, tmp_path):
-    class Closed(Network):
-        def state(self):
-            raise CloudError("no token")
-
-    with pytest.raises(CloudError, match="no token"):
-        drive(tmp_path, Closed(FakeCloud()), scans)
-    cloud = FakeCloud()
-    drive(tmp_path, Network(cloud), scans, resume=True)
-    assert len(cloud.stored) == len(alone)
-
-
 def test_a_full_disk_does_not_fill_the_memory(scans, tmp_path, monkeypatch):
     def put(_self, _packets):
         raise InputError("disk full")

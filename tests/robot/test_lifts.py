@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.lidar.lost import LostConfig
 from fcslam.records import Channel, LaserModel, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from tests.lidar.worlds import box
@@ -77,7 +76,3 @@ def test_people_around_a_robot_are_no_cabin():
         near = frozen(np.minimum(scan.ranges_m, rng.uniform(0.8, 1.5, len(scan.ranges_m))), np.float32)
         crowd.append(replace(scan, ranges_m=near) if 200 <= number < 240 else scan)
     assert len(driven(crowd)) == 1
-
-
-def test_without_the_detection_both_floors_are_one_session():
-    assert len(driven(ride(1, 2)[0], ROBOT.model_copy(update={"lost": LostConfig(doubted=0.0)}))) == 1

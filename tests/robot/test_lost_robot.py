@@ -57,15 +57,6 @@ def replace_epoch(packet):
     return encode(replace(packet, epoch=0, body=body))
 
 
-def test_who_cannot_be_lost_ties_the_two_places_together():
-    scans, moment = kidnapping()
-    robot, packets = driven(scans, BLIND)
-    assert len(robot.tracks) == 1
-    stamps = {p.body.id.number: p.body.stamp for p in packets if isinstance(p.body, Keyscan)}
-    motions = [packet.body for packet in packets if isinstance(packet.body, Constraint)]
-    assert any(stamps[motion.i] <= moment < stamps[motion.j] for motion in motions)
-
-
 def test_a_robot_that_drove_on_unseen_begins_anew():
     scans = [scan for scan in drives()[0] if scan.stamp < 1010.0]
     T_odom_there = np.array((26.0, 3.0, 0.4))

@@ -174,8 +174,3 @@ def test_quality_falls_with_the_first_keyscan_that_shows_other_walls(fleet, buil
     mirrored = replace(last.points, points=last.points.points * (1, -1), normals=last.points.normals * (1, -1))
     localizer.submit(replace(kept.inputs[8], keyscan=replace(last, points=mirrored)))
     assert localizer.estimate is None or localizer.estimate.quality < 0.7
-
-
-def test_frozen_map_of_a_mission_matches_the_scans(fleet, building):
-    frozen = frozen_map(building, "building")
-    assert len(frozen.surface) > 300

@@ -121,31 +121,11 @@ def test_a_drive_along_one_circle_fixes_no_mounting(tmp_path, monkeypatch):
     assert spinning.error_m(frontend.tracks[0]) < 0.02
 
 
-@pytest.mark.parametrize("at", [2.0, 3.0, 6.0, 8.0, 12.0])
-def test_odometry_of_scans_that_starts_at_zero_again_bends_nothing(at):
-    """The jump is 0.5 to 2.4 m and 0.7 to 2.9 rad, so a robot might have made it."""
-    frontend, _ = mapped(spinning.drive(odometry=reset(integrated(), (at,))))
-    assert len(frontend.tracks) == 1
-    assert spinning.error_m(frontend.tracks[0]) < 0.005
-
-
-def test_beam_times_that_are_ignored_bend_the_track():
-    frontend, _ = mapped(spinning.drive(odometry=spinning.pose_at, states_sweep=False))
-    assert max(map(spinning.error_m, frontend.tracks)) > 0.02
-
-
 def test_the_duration_of_a_scan_can_be_a_setting():
     config = RobotConfig(lidar=LidarConfig(scan_duration_s=spinning.SWEEP_S))
     frontend, _ = mapped(spinning.drive(odometry=spinning.pose_at, states_sweep=False), config)
     assert len(frontend.tracks) == 1
     assert spinning.error_m(frontend.tracks[0]) < 0.03
-
-
-def test_odometry_that_never_changes_is_not_used():
-    frontend, _ = mapped(spinning.drive(odometry=lambda _: np.zeros(3)))
-    assert not frontend.motion.model.is_measured
-    assert len(frontend.tracks) == 2
-    assert spinning.error_m(frontend.tracks[1]) < 0.005
 
 
 @pytest.mark.parametrize("begin_s", [1.0, 1.6, 4.0])
@@ -179,15 +159,6 @@ def test_without_odometry_a_robot_that_drives_on_in_a_gap_of_its_scans_is_found_
     assert len(frontend.tracks) == 1
     assert len(frontend.tracks[0]) == len(scans)
     assert spinning.error_m(frontend.tracks[0]) < 0.01
-
-
-@pytest.mark.parametrize("gap_s", [2.0, 3.0])
-def test_without_odometry_a_robot_put_into_another_room_in_a_gap_is_lost(gap_s):
-    elsewhere = spinning.WALLS * (1.3, 1.5, 1.3, 1.5) + (0.5, 1.0, 0.5, 1.0)
-    drives = spinning.drive(9.0), spinning.drive(14.0, begin_s=9.0 + gap_s, walls=elsewhere)
-    frontend, _ = mapped(scan for part in drives for scan in part)
-    assert [len(track) * spinning.SCAN_S for track in frontend.tracks] == pytest.approx([9.0, 14.0], abs=0.2)
-    assert all(spinning.error_m(track) < 0.01 for track in frontend.tracks)
 
 
 @pytest.mark.parametrize(("moved_s", "sessions"), [(0.0, 1), (12.0, 2)])

@@ -12,7 +12,7 @@ from fcslam.errors import CloudError, InputError, OversizeError, UnavailableErro
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import ASK_AFTER_S, LONGEST_RETRY_S, SEND_INTERVAL_S, Sender, retry_delay_s
 from fcslam.wire.http_transport import HttpResponse
-from fcslam.wire.packets import decode, encode
+from fcslam.wire.packets import encode
 from tests.robot.fake_cloud import FakeCloud, Network, content, said
 from tests.wire.examples import DETECTOR_UPDATE, HELLO, LIDAR_PLACE
 
@@ -94,19 +94,6 @@ def test_every_packet_arrives_once_and_in_order(tmp_path_factory, moments, large
     robot.outbox.close()
 
 
-def test_a_cloud_that_is_away_costs_nothing_but_time(robot):
-    network = robot.network
-    network.faults += ["request lost"] * 12
-    robot.outbox.put([said(k) for k in range(10)])
-    delays = [robot.step() for _ in range(12)]
-    assert robot.sender.trouble == "no answer"
-    assert max(delays) <= LONGEST_RETRY_S
-    assert network.cloud.stored == {}
-    robot.step()
-    assert len(network.cloud.stored) == 10
-    assert robot.sender.trouble is None
-
-
 def test_waiting_grows_to_a_bound_and_is_spread_over_all_of_it():
     rng = np.random.default_rng(1)
     for failures, bound in ((1, 1.0), (3, 4.0), (6, LONGEST_RETRY_S), (10**6, LONGEST_RETRY_S)):
@@ -164,21 +151,6 @@ def test_a_correction_of_an_earlier_start_is_about_another_odometry(tmp_path):
     assert list(network.cloud.stored) == [(0, 0), (1, 0)]
     assert [correction.version for correction in anew.corrections] == [5]
     anew.outbox.close()
-
-
-def test_a_refused_packet_is_set_aside_and_those_behind_it_get_through(robot):
-    packets = [said(k, time=2000.0 + k) for k in range(6)]
-    network = robot.network
-    network.cloud.unwanted = {content(encode(packets[k])) for k in (2, 3)}
-    robot.outbox.put(packets)
-    for _ in range(5):
-        robot.step()
-    assert robot.refused == [(content(encode(packets[k])), "unwanted") for k in (2, 3)]
-    times = {(0, k): 2000.0 + k for k in (0, 1, 4, 5)}
-    assert {key: decode(data).time for key, data in network.cloud.stored.items()} == times
-    assert (robot.sender.confirmed, robot.sender.refusals) == (4, 2)
-    assert robot.outbox.waiting == (0, 0)
-    assert network.requests == 4, "one to meet, three to send: what was refused in an answer is not asked for again"
 
 
 def test_a_refused_packet_stays_until_it_is_kept_elsewhere(robot):

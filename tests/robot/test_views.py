@@ -9,13 +9,10 @@ import pytest
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
 from fcslam.config import dump, load
-from fcslam.errors import FeatureError
 from fcslam.features.detector import OnnxConfig, OnnxDetector
-from fcslam.features.detector_kinds import DetectorKind
 from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus, Keyscan, LaserScan, Place, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.robot.views import ViewsConfig
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
 from tests.features.networks import tiny_network
@@ -119,14 +116,6 @@ def test_a_robot_that_stands_still_sees_nothing_new(seen):
     assert len(places(bodies_of(standing)[0])) == 1
 
 
-def test_channels_are_a_choice(seen):
-    for channels in ((Channel.LIDAR,), (Channel.CAMERA,)):
-        bodies, _ = bodies_of(seen[0], RobotConfig(channels=channels))
-        hello = next(body for body in bodies if isinstance(body, Hello))
-        assert set(hello.detector_versions) == set(channels)
-        assert {body.channel for body in bodies if isinstance(body, Place)} == set(channels)
-
-
 def test_a_network_describes_places_in_its_own_version(seen, tmp_path):
     pytest.importorskip("onnxruntime")
     tiny_network(tmp_path / "n.onnx", version="tiny-7")
@@ -139,13 +128,6 @@ def test_a_network_describes_places_in_its_own_version(seen, tmp_path):
     assert hello.detector_versions[Channel.CAMERA] == "tiny-7"
     assert len(places(bodies)) > 5
     assert {place.detector_version for place in places(bodies)} == {"tiny-7"}
-
-
-def test_a_network_that_is_missing_is_told_at_once(tmp_path):
-    pytest.importorskip("onnxruntime")
-    views = ViewsConfig(detector=DetectorKind.ONNX, weights=tmp_path / "missing.onnx")
-    with pytest.raises(FeatureError, match="cannot read the network weights"):
-        RobotFrontend("r", RobotConfig(views=views))
 
 
 def test_images_change_nothing_but_camera_places(seen):

@@ -78,13 +78,6 @@ def test_momentum_goes_no_further_than_all_robots_one_after_another(robots, most
     assert same(end(0.9), end(0.2)) is (robots == 1)
 
 
-def test_statistics_are_taken_as_they_were_measured(tmp_path):
-    state, _ = run([Fake("a", 0.5), Fake("b", 0.5)], tmp_path, settings(rounds=3), rules=rules(momentum=0.5))
-    assert state.weights["a.running_var"] == pytest.approx(1.0 + 3 * 0.5)
-    steps = 0.5 * np.array([1.0, 1.5, 1.75]) * 0.5  # each round's share of momentum, on top of its update
-    assert state.weights["b.weight"] == pytest.approx(0.5 + 3 * 0.5 + steps.sum())
-
-
 def test_what_is_judged_and_released_is_a_mean_of_rounds(tmp_path):
     judged = []
 
@@ -205,12 +198,6 @@ def test_only_a_share_takes_part_and_all_in_turn(tmp_path):
     assert {len(report.robots) for report in reports} == {3}
     assert all(robot.asked for robot in robots)
     assert len({report.robots for report in reports}) > 1
-
-
-def test_bytes_are_those_of_the_arrays(tmp_path):
-    _, reports = run([Fake("a"), Fake("b")], tmp_path)
-    content = sum(array.nbytes for array in START.values())
-    assert [(report.bytes_down, report.bytes_up) for report in reports] == [(2 * content,) * 2] * 2
 
 
 def test_without_anybody_the_server_says_so_or_waits(tmp_path):

@@ -127,13 +127,6 @@ def test_a_request_is_withdrawn_at_the_deadline(grid):
     assert grid.next_request("one") is None
 
 
-def test_who_waits_gets_the_replies(grid):
-    with asked(grid, "one", "two") as replies:
-        for robot in ("one", "two"):
-            grid.store_reply(robot, grid.next_request(robot)[0], reply_of(robot))
-    assert sorted(replies) == ["one", "two"]
-
-
 def test_a_fleet_has_room_for_so_many():
     grid = FleetGrid()
     assert all(grid.admits(str(number)) for number in range(MAX_ROBOTS))
