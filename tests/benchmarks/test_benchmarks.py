@@ -13,11 +13,7 @@ import pytest
 from evaluation import map_search
 from scipy.ndimage import binary_dilation
 
-from fcslam.config import load as load_config
 from fcslam.geometry import se2
-from fcslam.mission.mission import MissionConfig
-from fcslam.records import Channel
-from tests.features.networks import tiny_network
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SHARED = ("common", "convert_logs", "processes")
@@ -121,31 +117,3 @@ def test_the_search_finds_where_a_piece_was_cut_out():
 @pytest.fixture
 def camera_detectors():
     return load(FOLDER / "camera_detectors.py")
-
-
-def outcome(module, seed, detector, recall):
-    found = {f"{module.VERIFIED}_{name}": recall for name in module.RECALLS.values()}
-    return module.Outcome("default", seed, detector, found, 1.0)
-
-
-def test_detectors_are_compared_fleet_by_fleet(camera_detectors):
-    recalls = {"orb": (0.5, 0.9, 0.7), "net": (0.6, 0.8, 1.0)}
-    outcomes = [
-        outcome(camera_detectors, seed, name, values[seed]) for seed in range(3) for name, values in recalls.items()
-    ]
-    (row,) = camera_detectors.gains(outcomes, ["default"], ("orb", "net"))
-    assert row[:2] == ("default", "net")
-    assert row[-1] == "2 of 3"
-    assert row[2].startswith("+0.100 [-0.100, +0.300]")
-
-
-def test_each_detector_alone_describes_the_camera_places(camera_detectors, tmp_path):
-    paths = [tmp_path / f"{name}.onnx" for name in ("first", "second")]
-    for path in paths:
-        tiny_network(path, version=path.stem)
-    files = camera_detectors.settings(paths, tmp_path)
-    assert list(files) == ["orb", "first", "second"]
-    robots = [load_config(MissionConfig, file).robot for file in files.values()]
-    assert {robot.channels for robot in robots} == {(Channel.CAMERA,)}
-    assert [str(robot.views.detector) for robot in robots] == ["orb", "onnx", "onnx"]
-    assert [robot.views.weights for robot in robots] == [None, *paths]

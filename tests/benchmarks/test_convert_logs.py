@@ -68,13 +68,6 @@ def test_logs_in_centimetres(tmp_path):
     np.testing.assert_allclose(np.degrees(scans[0].laser.angles_rad()), np.arange(-90, 90), atol=1e-9)
 
 
-def test_the_two_poses_of_a_scan_say_where_the_laser_is(tmp_path):
-    scans = converted(
-        tmp_path / "run.log", [f"L 100 0 1.570796327 100 25 1.570796327 {'80.5 ' * 180}{k}" for k in (0, 1)]
-    )
-    assert scans[1].laser.T_base_laser == pytest.approx((0.25, 0.0, 0.0), abs=1e-4)
-
-
 def test_scans_without_stamps_take_the_pose_before_them(tmp_path):
     scans = converted(tmp_path / "loop.log", dpslam(5)[1:])
     assert [scan.stamp for scan in scans] == [0.0, 1.0, 2.0, 3.0], "the first scan has no pose"
@@ -120,12 +113,6 @@ def test_a_damaged_line_costs_only_itself(tmp_path, damaged):
         np.testing.assert_array_equal(one.T_odom_base, other.T_odom_base)
 
 
-def test_encoders_that_are_reset_cost_one_line(tmp_path):
-    lines = ticks(np.outer(0.03 * np.arange(60) + 8.0, (1.0, 1.1)))
-    again = [ticks_line(11_000_000 + 100_000 * k, 190 * k, 210 * k) for k in range(40)]
-    assert len(converted(tmp_path / "exp.dat", [*lines, *again])) == 99
-
-
 @pytest.mark.parametrize(
     "fields", [{}, {"theta": [-1.4 + 0.4 * k for k in range(8)], "min_theta": "none", "max_theta": "none"}]
 )
@@ -135,18 +122,6 @@ def test_logs_of_csm(tmp_path, fields):
     np.testing.assert_array_equal([scan.T_odom_base for scan in scans], [pose_at(k) for k in range(3)])
     np.testing.assert_allclose(scans[0].ranges_m, [1.0, 1.1, 1.2, 0.0, 1.4, 1.5, 1.6, 0.0], rtol=1e-6)
     assert scans[0].laser.angles_rad()[[0, -1]] == pytest.approx((-1.4, 1.4))
-
-
-def test_angles_of_csm_may_run_clockwise_and_odometry_may_lack(tmp_path):
-    turned = {"min_theta": 1.4, "max_theta": -1.4, "odometry": [None] * 3}
-    scans = converted(tmp_path / "run.json", [csm(k, **turned) for k in range(2)])
-    np.testing.assert_allclose(scans[0].ranges_m, [0.0, 1.6, 1.5, 1.4, 0.0, 1.2, 1.1, 1.0], rtol=1e-6)
-    assert np.isnan(scans[0].T_odom_base).all()
-
-
-@pytest.mark.parametrize("line", ['{"readings": ' + "[" * 5000, csm(0, readings=[1.0] * 7), csm(0, max_theta=-1.4)])
-def test_lines_of_csm_that_are_no_scans(tmp_path, line):
-    assert len(converted(tmp_path / "run.json", [csm(0), line])) == 1
 
 
 @pytest.mark.parametrize("lines", [cmu(30), dpslam(30), ticks(np.outer(0.03 * np.arange(30), (1.0, 1.1)))])

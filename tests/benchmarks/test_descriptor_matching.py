@@ -32,8 +32,3 @@ def test_neighbours_are_those_of_the_loops(kind):
 def test_codes_match_as_those_of_places_do():
     a, b = sets(np.uint8)
     assert np.array_equal(mutual_pairs(*nearest_neighbours(a, b)), mutual_matches(a, b).pairs)
-
-
-def test_of_equals_the_first_counts():
-    codes = np.zeros((3, 32), np.uint8)
-    assert mutual_pairs(*nearest_neighbours(codes, codes)).tolist() == [[0, 0]]

@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation.relation_closures import build_relation_graph, evaluate_closures
+from evaluation.relation_closures import evaluate_closures
 
 from fcslam.cli import main
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.closures import ClosureScope, closure_rows
-from fcslam.lab.evaluation.relations import pose_table
+from fcslam.lab.evaluation.closures import ClosureScope
 from fcslam.metrics.relations import Relations
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, RobotTrajectory, Run
@@ -136,37 +135,6 @@ def test_a_false_relation_is_left_out_and_said(tmp_path, relations):
     assert score.graph.translation_m[1] < 1e-5
     assert score.chain == (5, 9)  # of 1 and 9: not over the false one
     assert evaluate_closures(run, relations).relations.holds.all()
-
-
-def test_robots_of_one_clock_are_told_apart_by_name():
-    stamps = np.arange(5.0)
-    poses = np.zeros((5, 3))
-    both = {robot: RobotTrajectory(robot, 0, stamps, poses) for robot in "ab"}
-    rows = [ClosureRow("a", 1.0, "b", 1.0, Channel.LIDAR, 0.0, np.zeros(3), ACCEPTED, Reason(ReasonCode.VERIFIED))]
-    rows += [
-        ClosureRow("nobody", 1.0, "b", 9.0, Channel.LIDAR, 0.0, np.zeros(3), ACCEPTED, Reason(ReasonCode.VERIFIED))
-    ]
-    run = Run(both, tuple(rows))
-    table = pose_table(run)
-    found = closure_rows(run, table)
-    assert table.robots[found[0]].tolist() == [0, 1]
-    assert table.stamps[found[0]].tolist() == [1.0, 1.0]
-    assert found[1].tolist() == [-1, -1]
-
-
-def test_the_optimized_graph_averages_what_scatters():
-    """Many noisy relations between two rounds: the optimum is nearer to the truth than one of them is."""
-    rng = np.random.default_rng(9)
-    ends = [((0, int(a)), (0, int(b))) for a, b in rng.integers(0, 2 * ROUND, (3000, 2)) if a != b]
-    true = relations_between(ends)
-    noisy = Relations(true.stamps, se2.compose(true.T_1_2, se2.exp(rng.normal(0, (0.03, 0.03, 0.01), (len(true), 3)))))
-    graph = build_relation_graph(noisy)
-    assert graph.holds.mean() > 0.98
-    steps = np.round((graph.stamps - stamp(0, 0)) / 0.4)
-    motion = se2.between(graph.T_component_base[0], graph.T_component_base[1:])
-    error = se2.between(se2.between(truth(steps[0]), truth(steps[1:])), motion)
-    assert np.hypot(error[:, 0], error[:, 1]).mean() < 0.02
-    assert np.median(graph.residual_m) == pytest.approx(0.03 * np.sqrt(2 * np.log(2)), rel=0.1)
 
 
 @pytest.mark.system

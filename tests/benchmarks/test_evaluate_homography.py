@@ -7,7 +7,6 @@ from evaluation.detectors import EvaluatedDetectorKind, SceneKind, choose_detect
 from evaluation.homography import (
     LARGE,
     SMALL,
-    HomographyGroundTruth,
     column,
     difference,
     evaluate_homography,
@@ -72,13 +71,6 @@ def test_what_can_be_matched_is(report):
         assert {size for detector, size in report.milliseconds if detector == name} == {SMALL, LARGE}
 
 
-def test_corners_have_repeatability_alone(report):
-    pairs = report.of("harris")
-    assert mean(pairs, "repeatability") > 0.6
-    assert not any(pair.matching for pair in pairs)
-    assert np.isnan(mean(pairs, "accuracy_3px_nms8"))
-
-
 def test_differences_are_those_of_the_pairs(report):
     first, other = report.of("orb"), report.of("harris")
     gain = difference(first, other, "repeatability", seed=1)
@@ -109,14 +101,6 @@ def test_without_names_there_is_all_but_two_of_one_network(tmp_path):
     assert names == ["tiny-1", "tiny-1-logits", "orb", "sift", "fast", "harris", "shi"]
     with pytest.raises(InputError, match="tiny-1: named twice"):
         choose_detectors([EvaluatedDetectorKind.ONNX], [path, path])
-
-
-def test_the_legacy_truth_spares_the_light_and_ruins_the_turn(scenes):
-    detectors = choose_detectors([EvaluatedDetectorKind.ORB], [])
-    found = find_scenes([scenes])
-    legacy = evaluate_homography(found, detectors, HomographyGroundTruth.LEGACY).of("orb")
-    assert mean(legacy, "homography_3px_nms0", SceneKind.ILLUMINATION) == 1.0
-    assert mean(legacy, "homography_3px_nms0", SceneKind.VIEWPOINT) == 0.0
 
 
 def test_the_homography_is_judged_in_common_view_the_matches_among_the_strongest():

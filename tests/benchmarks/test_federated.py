@@ -103,29 +103,6 @@ def test_an_interrupted_study_ends_as_if_it_had_not_been(finished, robots, tmp_p
 
 
 @pytest.mark.training
-def test_robots_own_networks_share_the_pairs_out(finished):
-    local = finished[1].measured["local"]
-    shown = np.isfinite(local[..., 0])
-    assert (shown.sum(axis=1) == 1).all()
-    assert (shown.sum(axis=0) == 1).all()  # over two seeds each of both networks sees each pair once
-
-
-@pytest.mark.training
-def test_every_network_sees_as_many_samples(robots, tmp_path):
-    steps = {}
-
-    def watch(name, done, of):
-        steps[name] = of
-
-    wide = Arm(together=False, settings={"training": TINY["training"] | {"pairs": 2}})
-    run_study(study(robots, tmp_path, watch, seeds=1, arms={"averaged": Arm(), "wide": wide}))
-    assert steps["central, seed 1"] == steps["local-north, seed 1"] == steps["local-south, seed 1"] == 2 * 2 * 2
-    assert steps["alone-north, seed 1"] == 2 * 2
-    assert steps["averaged, seed 1"] == 2
-    assert steps["wide, seed 1"] == 2 * 2
-
-
-@pytest.mark.training
 def test_a_network_matches_a_view_with_itself(robots, tmp_path):
     torch.manual_seed(1)
     network = KeypointNetwork("light").eval()

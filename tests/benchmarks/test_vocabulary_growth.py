@@ -6,9 +6,7 @@ from evaluation.place_features import choose_features, describe_sets
 from evaluation.vocabulary_growth import (
     BATCH,
     MEASURES,
-    ahead_of,
     draw_groups,
-    fixed_growths,
     group_measures,
     grow_vocabulary,
 )
@@ -84,13 +82,3 @@ def test_the_last_words_are_those_of_an_index_that_saw_the_same(world):
         np.testing.assert_allclose(growth.similarities[0, g], expected)
         answers = {found.id: found.similarity for found in index.query(group.target, BATCH)}
         np.testing.assert_allclose(growth.asked[g], [answers.get(name, 0.0) for name in group.names])
-
-
-def test_what_is_fixed_stays(world):
-    groups, arrivals = world
-    training = [place.descriptors for place in arrivals[:10]]
-    for growth in fixed_growths(arrivals, groups, training, SEED).values():
-        assert (growth.similarities == growth.similarities[0]).all()
-        assert np.isnan(growth.seconds).all()
-        difference = ahead_of(growth, growth, "significance", SEED)
-        assert tuple(difference) == (0.0, 0.0, 0.0)

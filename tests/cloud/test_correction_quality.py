@@ -45,8 +45,31 @@ def test_closures_count_for_both_robots_and_less_with_travel(scripted, count):
     assert qualities(cloud) == pytest.approx({"a": here, "b": here})
 
 
-def test_nobody_bears_out_a_robot_in_a_map_of_its_own(scripted):
-    assert qualities(feed(scripted(closures(A, B, PAIRS[:2])), two_robots())) == {"a": 0.0, "b": 0.0}
+(UNLIKE,) = (replace(line, passes=False) for line in closures(A, B, [(48, 48)]))
+
+
+def elsewhere(i, j):
+    return closures(A, B, [(i, j)], shift=ALIAS)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "others", "of_a", "of_b"),
+    [
+        (PAIRS[:2], [], 0.0, 0.0),
+        (PAIRS[:5], elsewhere(48, 48), 0.0, 0.0),
+        (PAIRS, [UNLIKE], expected(PAIRS, 48) / 2, expected(PAIRS, 48) / 2),
+        (PAIRS, elsewhere(40, 44), expected(PAIRS, 44), expected(PAIRS, 44) / 2),
+        (PAIRS, elsewhere(4, 48), expected(PAIRS, 44), 0.0),
+        (PAIRS[:5], closures(A, B, [(0, 8), (4, 12)]), expected(PAIRS[:5], 16), expected(PAIRS[:5], 16)),
+    ],
+    ids=[
+        "maps of their own", "the newest place shows something else", "a place is not verified where it is predicted",
+        "a match differs from the map", "an older place differs", "a place with several closures counts once",
+    ],
+)  # fmt: skip
+def test_what_bears_out_where_a_robot_is(scripted, pairs, others, of_a, of_b):
+    found = qualities(feed(scripted(closures(A, B, pairs), others), two_robots()))
+    assert found == pytest.approx({"a": of_a, "b": of_b})
 
 
 def test_a_robot_hears_of_it_with_the_place_that_joins_it_until_it_drives_away(scripted):
@@ -60,37 +83,6 @@ def test_a_robot_hears_of_it_with_the_place_that_joins_it_until_it_drives_away(s
     assert np.all(np.diff(heard[:4]) > 0.0)
     assert np.all(np.diff(heard[3:]) < 0.0)
     assert heard[-1] < 0.1
-
-
-def test_a_place_that_shows_something_else_than_the_map_bears_out_nothing(scripted):
-    cloud = feed(scripted(closures(A, B, PAIRS[:5]), closures(A, B, [(48, 48)], shift=ALIAS)), two_robots())
-    assert qualities(cloud) == {"a": 0.0, "b": 0.0}
-
-
-def test_a_place_that_is_not_verified_where_the_map_predicts_it_counts_half(scripted):
-    (unlike,) = closures(A, B, [(48, 48)])
-    cloud = feed(scripted(closures(A, B, PAIRS), [replace(unlike, passes=False)]), two_robots())
-    half = expected(PAIRS, 48) / 2
-    assert qualities(cloud) == pytest.approx({"a": half, "b": half})
-
-
-def test_verified_matches_that_differ_from_the_map_lower_the_share(scripted):
-    cloud = feed(scripted(closures(A, B, PAIRS), closures(A, B, [(40, 44)], shift=ALIAS)), two_robots())
-    whole = expected(PAIRS, 44)
-    assert qualities(cloud) == pytest.approx({"a": whole, "b": whole / 2})
-
-
-def test_a_match_with_an_older_place_of_a_robot_says_nothing_about_where_it_is_now(scripted):
-    cloud = feed(scripted(closures(A, B, PAIRS), closures(A, B, [(4, 48)], shift=ALIAS)), two_robots())
-    assert qualities(cloud) == pytest.approx({"a": expected(PAIRS, 44), "b": 0.0})
-
-
-def test_a_place_with_closures_to_several_others_counts_once(scripted):
-    pairs = [(k, k) for k in range(0, 20, 4)]
-    twice = closures(A, B, [(0, 8), (4, 12)])
-    cloud = feed(scripted(closures(A, B, pairs), twice), two_robots())
-    assert cloud.fleet.closure_counts()["between robots"] == 7
-    assert qualities(cloud) == pytest.approx({"a": expected(pairs, 16), "b": expected(pairs, 16)})
 
 
 def test_what_is_vetoed_bears_out_nothing(scripted):

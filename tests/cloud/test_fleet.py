@@ -263,6 +263,7 @@ def test_maps_of_several_robots_join_whoever_came_first(scripted, names):
     result = feed(scripted(*meetings), in_order(packets)).finalize()
     assert map_of(result) == dict.fromkeys("abcd", 0)
     assert all(joint_error(result, "a", robot) < 1e-3 for robot in "bcd")
+    assert np.array_equal(result.robots[0].T_map_base[0], np.zeros(3)), "in the frame of the robot that began first"
 
 
 def test_no_fusing_means_no_comparing(scripted):

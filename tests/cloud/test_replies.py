@@ -56,6 +56,7 @@ def test_a_detector_is_announced_until_the_robot_uses_it(versions, sent):
         ({"T_map_odom": frozen((1.0 + 0.9 * NEWS_M, 2.0, 3.1))}, False),
         ({"T_map_odom": frozen((1.0, 2.0 - 1.1 * NEWS_M, 3.1))}, True),
         ({"T_map_odom": frozen((1.0, 2.0, 3.1 + 1.1 * NEWS_RAD))}, True),
+        ({"T_map_odom": frozen((1.0, 2.0, 3.1 - 2.0 * np.pi))}, False),
         ({"quality": 0.51}, False),
         ({"quality": 0.53}, True),
         ({"quality": 0.0}, True),
@@ -64,8 +65,3 @@ def test_a_detector_is_announced_until_the_robot_uses_it(versions, sent):
 def test_what_is_news(change, expected):
     assert is_news(CORRECTION, replace(CORRECTION, **change)) is expected
     assert is_news(None, CORRECTION)
-
-
-def test_headings_on_both_sides_of_half_a_turn_are_near():
-    left, right = (replace(CORRECTION, T_map_odom=frozen((0.0, 0.0, theta))) for theta in (np.pi, -np.pi + 1e-7))
-    assert not is_news(left, right)

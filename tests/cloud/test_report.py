@@ -15,21 +15,20 @@ from tests.scripted import closures, rectangle, stream
 from tests.small_fleet import feed, in_order
 
 POSES = rectangle()
-FILES = {"map.pgm", "map.yaml", "map.png", "map_1.pgm", "map_1.yaml"}
+FIRST, SECOND = {"map.pgm", "map.yaml", "map.png"}, {"map_1.pgm", "map_1.yaml"}
 
 
-@pytest.mark.parametrize(("keyscans", "more"), [(LEAST_DRAWN - 1, set()), (LEAST_DRAWN, {"map_1.png"})])
-def test_of_the_smaller_maps_those_of_a_few_keyscans_get_no_picture(scripted, keyscans, more):
-    packets = [*stream("a", POSES, start_s=0.0), *stream("b", POSES[:keyscans], start_s=0.0)]
+@pytest.mark.parametrize(
+    ("keyscans", "files"),
+    [
+        ((61, LEAST_DRAWN - 1), FIRST | SECOND), ((61, LEAST_DRAWN), FIRST | SECOND | {"map_1.png"}), ((1, 0), FIRST),
+    ],
+)  # fmt: skip
+def test_maps_have_a_picture_but_smaller_ones_of_few_keyscans(scripted, keyscans, files):
+    packets = [p for robot, n in zip("ab", keyscans, strict=True) if n for p in stream(robot, POSES[:n], start_s=0.0)]
     result = feed(scripted(), packets).finalize()
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
-    assert set(run_of(result, tracks, [], "", OccupancyConfig()).map_files) == FILES | more
-
-
-def test_the_largest_map_has_a_picture_however_small_it_is(scripted):
-    result = feed(scripted(), stream("a", POSES[:1], start_s=0.0)).finalize()
-    tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
-    assert set(run_of(result, tracks, [], "", OccupancyConfig()).map_files) == {"map.pgm", "map.yaml", "map.png"}
+    assert set(run_of(result, tracks, [], "", OccupancyConfig()).map_files) == files
 
 
 def test_the_pose_graph_of_two_robots_comes_back_with_its_odometry_and_closures(scripted, tmp_path):

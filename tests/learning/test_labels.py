@@ -21,11 +21,6 @@ def test_peaks_are_found_between_pixels_strongest_first():
     assert len(peaks(response, 4, 1)) == 1
 
 
-def test_a_detector_that_answers_the_same_everywhere_averages_to_itself():
-    mean = adapt(lambda image: np.ones(image.shape, np.float32), textured(0), 6, np.random.default_rng(0))
-    assert mean == pytest.approx(np.ones_like(mean), abs=1e-5)
-
-
 def test_what_one_copy_alone_saw_fades():
     calls = []
 
@@ -48,11 +43,6 @@ def test_points_of_both_come_first_and_lie_midway():
     assert len(labels.keypoints) == 3
     assert (np.diff(labels.quality) < 0).all()
     assert labels.quality[0] == 1.0
-
-
-def test_one_detector_may_find_nothing():
-    assert len(fuse_keypoints(points(), points((5, 5))).keypoints) == 1
-    assert len(fuse_keypoints(points(), points()).keypoints) == 0
 
 
 def test_no_two_labels_are_one_point():

@@ -43,13 +43,6 @@ def test_networks_are_small(encoder, most):
     assert sum(parameter.numel() for parameter in network(encoder).parameters()) < most
 
 
-@encoders
-def test_a_blank_image_gives_finite_maps(encoder):
-    maps = network(encoder)(torch.full((1, 1, 32, 32), 0.5))
-    assert torch.isfinite(maps.point_logits).all()
-    assert torch.isfinite(maps.code_logits).all()
-
-
 def test_the_probabilities_of_a_cell_sum_to_one():
     logits = torch.randn(1, 16, 24)
     places = cell_probabilities(logits).unfold(1, 8, 8).unfold(2, 8, 8).sum((-1, -2))

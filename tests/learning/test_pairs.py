@@ -83,9 +83,3 @@ def test_the_teachers_descriptors_stay_with_their_points():
     assert pair.teacher_valid.any()
     for told in pair.teacher_descriptors[pair.teacher_valid]:
         assert (source.teacher.descriptors.astype(np.float32) == told).all(axis=1).any()
-
-
-def test_the_same_generator_draws_the_same_pair():
-    a, b = (draw_pair(example(), SIZE, 64, 32, np.random.default_rng(8)) for _ in range(2))
-    assert np.array_equal(a.views[0].image, b.views[0].image)
-    assert np.array_equal(a.views[1].targets, b.views[1].targets)

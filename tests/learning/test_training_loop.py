@@ -35,19 +35,6 @@ def start():
     return KeypointNetwork("light").state_dict()
 
 
-def test_a_leg_does_its_steps_and_says_so(examples, start):
-    done = []
-    before = {name: tensor.clone() for name, tensor in start.items()}
-    network, losses, _ = local_training(
-        start, examples, LocalTrainingPlan(SMALL, first_step=5, steps=3, on_step=done.append)
-    )
-    assert done == [1, 2, 3]
-    assert not network.training
-    assert {"detector", "contrastive", "triplet"} <= losses.keys()
-    assert all(torch.equal(start[name], before[name]) for name in start)
-    assert any(not torch.equal(start[name], tensor) for name, tensor in network.state_dict().items())
-
-
 def test_two_legs_are_one_if_the_second_knows_the_first_ones_moments(examples, start):
     whole = local_training(start, examples, LocalTrainingPlan(SMALL, 0, RAMP_STEPS + 3))
     first = local_training(start, examples, LocalTrainingPlan(SMALL, 0, RAMP_STEPS))

@@ -268,6 +268,8 @@ def test_a_scan_that_cannot_be_is_refused_and_the_next_one_is_not(robot, scans, 
         ({"laser": fcslam.LaserModel(9, 0.0, 0.1, 0.0)}, "max_range_m above 0"),
         ({"laser": {"a": fcslam.LaserModel(9, 0.0, 0.1, 5.0), "b": fcslam.LaserModel(9, 0.0, 0.1, 5.0)}}, "two lasers"),
         ({"config": {"robots": 1}}, "unknown key 'robots'"),
+        ({"camera": replace(CAMERA, fx=0.0)}, "a focal length above 0"),
+        ({"camera": replace(CAMERA, T_base_camera=fcslam.Transform((0, 0, 0), (0, 0, 0, 2)))}, "not a unit"),
     ],
 )
 def test_a_robot_that_cannot_be_is_one_line(arguments, reason):
@@ -331,18 +333,6 @@ def test_images_are_grey_or_rgb_and_of_the_camera(robot, scans):
                 seeing.add_image(wrong, scans[1].stamp)
     with pytest.raises(InputError, match="finished"):
         seeing.add_image(np.zeros((48, 64), np.uint8), scans[1].stamp)
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"fx": 0.0}, "a focal length above 0"),
-        ({"T_base_camera": fcslam.Transform((0, 0, 0), (0, 0, 0, 2))}, "not a unit"),
-    ],
-)
-def test_a_camera_that_cannot_be_is_one_line(change, reason):
-    with pytest.raises(InputError, match=reason):
-        fcslam.Robot("anna", camera=replace(CAMERA, **change), wiring=Wiring(SameThread()))
 
 
 def test_two_lasers_are_told_apart_by_name(scans):

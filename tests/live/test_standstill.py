@@ -29,17 +29,18 @@ def test_it_stops_after_ten_seconds_and_drives_with_the_first_motion():
     assert told(way) == [("stop", 10), ("drive", 15), ("stop", 25)]
 
 
-@pytest.mark.parametrize(("jitter_m", "stops"), [(0.5 * MOVED_M, 1), (1.5 * MOVED_M, 0)])
-def test_noise_is_no_motion(jitter_m, stops):
-    assert len(told(standing(0.0, 30, jitter_m=jitter_m))) == stops
-
-
-def test_a_slow_robot_drives():
-    assert told([(0.5 * k, np.array((0.006 * k, 0.0, 0.0))) for k in range(200)]) == []
-
-
-def test_a_robot_that_turns_drives():
-    assert told([(float(k), np.array((0.0, 0.0, 0.1 * k))) for k in range(30)]) == []
+@pytest.mark.parametrize(
+    ("way", "stops"),
+    [
+        (standing(0.0, 30, jitter_m=0.5 * MOVED_M), 1),
+        (standing(0.0, 30, jitter_m=1.5 * MOVED_M), 0),
+        ([(0.5 * k, np.array((0.006 * k, 0.0, 0.0))) for k in range(200)], 0),
+        ([(float(k), np.array((0.0, 0.0, 0.1 * k))) for k in range(30)], 0),
+    ],
+    ids=["noise", "a little more", "slow", "turns"],
+)
+def test_noise_is_no_motion_but_a_slow_or_turning_robot_drives(way, stops):
+    assert len(told(way)) == stops
 
 
 def test_without_odometry_the_pose_in_the_map_counts():

@@ -9,7 +9,6 @@ import pytest
 from fcslam.records import Channel, Constraint, ConstraintKind, Keyscan, Place
 from fcslam.robot.backend_runner import copied_worker, in_worker
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.wire.messages import Hello
 from fcslam.wire.packets import encode
 from tests import small_fleet
 from tests.robot.kidnapping import kidnapping
@@ -95,14 +94,6 @@ def test_a_back_end_that_breaks_costs_closures_and_places_but_no_keyscan(scans):
     kept = [p.body for p in expected if not isinstance(p.body, Place) and not is_closure(p.body)]
     assert contents_of([packet.body for packet in packets]) == contents_of(kept)
     assert [packet.sequence for packet in packets] == list(range(len(packets)))
-
-
-def test_a_back_end_that_breaks_at_once_leaves_a_map(scans):
-    robot, packets = driven(scans, in_worker("r", CONFIG, Held(breaks_after=1)))
-    assert packets[0].body == Hello("r", 0, (scans[0].laser,), {})
-    keyscans = [packet.body for packet in packets if isinstance(packet.body, Keyscan)]
-    assert len(keyscans) > max(pose.keyscan for pose in robot.scan_poses)
-    assert len(contents(packets)) == 2 * len(keyscans)
 
 
 def test_an_input_that_a_breaking_executor_loses_is_not_waited_for(scans):

@@ -5,22 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.features.birdseye import DETECTOR_VERSION
-from fcslam.features.detector import OnnxConfig, OnnxDetector
 from fcslam.records import (
     CameraImage,
     CameraModel,
-    Channel,
     Constraint,
     ConstraintKind,
     Keyscan,
-    Odometry,
     Place,
     Transform,
     frozen,
 )
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet
 
@@ -58,13 +53,6 @@ def test_broken_images_cause_no_packet_and_change_none(scans):
     assert RobotFrontend("r", RobotConfig()).process(seen[0]) == []
     both = [record for pair in zip(scans, seen, strict=True) for record in pair]
     assert [encode(packet) for packet in drive(both)[1]] == [encode(packet) for packet in drive(scans)[1]]
-
-
-def test_hello_comes_first_and_once(scans):
-    _, packets = drive(scans)
-    assert bodies(packets, Hello) == [packets[0].body]
-    versions = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: OnnxDetector(OnnxConfig()).version}
-    assert packets[0].body == Hello("r", 0, (scans[0].laser,), versions)
 
 
 def test_every_keyscan_is_followed_by_the_motion_that_leads_to_it(scans):
@@ -116,13 +104,6 @@ def test_ranges_between_two_steps_of_the_wire_make_no_difference(scans):
     ]
     expected = [encode(packet) for packet in drive(rounded)[1]]
     assert [encode(packet) for packet in drive(jittered)[1]] == expected
-
-
-def test_odometry_readings_alone_send_nothing(scans):
-    frontend = RobotFrontend("r", RobotConfig())
-    assert frontend.process(Odometry(0.0, frozen(np.zeros(3)))) == []
-    assert len(frontend.scan_poses) == 0
-    assert frontend.finish() == []
 
 
 def test_time_on_packets_never_goes_back(scans):

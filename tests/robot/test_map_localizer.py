@@ -83,14 +83,6 @@ def test_a_robot_is_found_without_an_initial_pose(fleet, building):
     assert ((poses.quality > 0.5) == poses.is_localized).all()
 
 
-def test_no_pose_in_the_map_of_another_building(fleet):
-    elsewhere = map_of(small_fleet.draw(1, 30.0, seed=7).robots)
-    run = localized(fleet.robots[2].scans(), elsewhere)
-    assert run.metrics["fixes"].value == 0
-    assert not run.localized["robot"].is_localized.any()
-    assert len(run.trajectories["robot"].stamps) == 0
-
-
 def test_a_small_map_of_another_building_with_such_rooms_does_not_place_a_robot():
     elsewhere = map_of(small_fleet.draw(1, 15.0, seed=7).robots)
     for robot in small_fleet.draw(3, 15.0, seed=1).robots[:2]:

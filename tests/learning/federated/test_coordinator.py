@@ -142,13 +142,6 @@ def test_a_kill_between_table_and_checkpoint_repeats_the_round(tmp_path):
         assert [row["round"] for row in csv.DictReader(file)] == ["1", "2", "3"]
 
 
-def test_the_order_of_robots_does_not_matter(tmp_path):
-    robots = [Fake(f"r{seed}", answer=ragged(seed)) for seed in range(4)]
-    first, _ = run(robots, tmp_path / "1")
-    second, _ = run(robots[::-1], tmp_path / "2")
-    assert same(first.weights, second.weights)
-
-
 def refuses(*_args):
     raise InputError("no images here")
 
@@ -224,23 +217,6 @@ def test_a_worse_detector_is_not_released_and_a_collapsed_one_is_undone(tmp_path
     first = ragged(1)(START, 0)
     assert same(state.weights, ragged(1)(first, 3))
     assert state.best_round == 4
-
-
-def test_after_a_collapse_the_mean_begins_anew_as_well(tmp_path):
-    scores = iter([0.5, 0.6, 0.2, 0.1])
-    judged = []
-
-    def judge(weights):
-        judged.append(weights)
-        return next(scores)
-
-    state, reports = run([Fake("a", 1.0)], tmp_path, settings(rounds=3), score=judge, rules=rules(smoothing=0.8))
-    assert [report.returned for report in reports] == [False, True, True]
-    assert same(state.weights, judged[1])
-    assert same(state.average, judged[1])
-    # Of the third round: what the second had come to is in it no more.
-    share = 3 / 12 * (3 - 2) / (0.3 * 3)
-    assert judged[3]["b.weight"] == pytest.approx(judged[1]["b.weight"] + (1.0 - min(share, 3 / 12)))
 
 
 def test_what_does_not_change_stays_to_the_last_bit_in_the_mean(tmp_path):

@@ -37,18 +37,6 @@ def test_a_version_that_passes_is_released(tmp_path):
     assert reports[0].row()["reason"] == "better on held-out pairs"
 
 
-def test_a_version_that_is_worse_is_not_released(tmp_path):
-    state, reports = gated([judge(f"r{k}", likes=-1.0) for k in range(3)], tmp_path)
-    assert not any(report.released for report in reports)
-    assert state.best_round == 0
-    assert "not better on held-out pairs" in reports[0].evaluation.reason
-
-
-def test_a_small_fleet_with_few_pairs_releases_nothing(tmp_path):
-    _, reports = gated([judge(f"r{k}", pairs=66) for k in range(3)], tmp_path)
-    assert [report.evaluation.reason for report in reports] == ["198 held-out pairs, 200 needed"] * 2
-
-
 def test_a_robot_whose_report_is_no_report_does_not_count(tmp_path):
     liar = Fake("r2", judge=lambda _weights: np.full((500, 2), 7.0, np.float32))
     _, reports = gated([judge("r0"), judge("r1"), liar], tmp_path)
