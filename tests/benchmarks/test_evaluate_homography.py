@@ -14,7 +14,6 @@ from evaluation.homography import (
     mean,
 )
 
-from fcslam.errors import InputError
 from fcslam.features.detector import ImageFeatures
 from fcslam.learning.homography import warp
 from tests.features.networks import tiny_network
@@ -92,15 +91,6 @@ def test_each_network_is_compared_by_its_bits_and_by_its_logits(scenes, tmp_path
         assert logits.matching[0].matches > 0
         assert logits.matching[0].score != bits.matching[0].score
     assert measured["first"].matching[0].score != measured["second"].matching[0].score
-
-
-def test_without_names_there_is_all_but_two_of_one_network(tmp_path):
-    path = tmp_path / "tiny.onnx"
-    tiny_network(path)
-    names = [each.name for each in choose_detectors([], [path])]
-    assert names == ["tiny-1", "tiny-1-logits", "orb", "sift", "fast", "harris", "shi"]
-    with pytest.raises(InputError, match="tiny-1: named twice"):
-        choose_detectors([EvaluatedDetectorKind.ONNX], [path, path])
 
 
 def test_the_homography_is_judged_in_common_view_the_matches_among_the_strongest():

@@ -4,7 +4,6 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-from evaluation.places import measure_interval
 from evaluation.retrieval import (
     PairTruth,
     excluding_recent,
@@ -115,23 +114,6 @@ def test_ignored_pairs_and_the_scale_count_for_nothing(question, random):
         single_best(similarity, truth).curve().recall, single_best(changed, truth).curve().recall
     )
     np.testing.assert_array_equal(mismatches(similarity, truth), mismatches(changed, truth))
-
-
-def test_a_pair_cannot_be_both():
-    both = np.ones((1, 1), bool)
-    with pytest.raises(ValueError, match="match and be different"):
-        PairTruth(both, both)
-    with pytest.raises(ValueError, match=r"\(Q, G\)"):
-        PairTruth(both, np.ones((1, 2), bool))
-
-
-def test_the_interval_of_a_mean_is_that_of_its_samples():
-    values = np.random.default_rng(0).normal(3.0, 2.0, 400)
-    interval = measure_interval(lambda rows: float(values[rows].mean()), len(values), np.random.default_rng(1))
-    assert interval.mean == pytest.approx(values.mean())
-    half = 1.96 * values.std() / np.sqrt(len(values))
-    assert (interval.low, interval.high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.3 * half)
-    assert np.isnan(measure_interval(lambda _: np.nan, 3, np.random.default_rng(1)).low)
 
 
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=20), st.integers(0, 12))

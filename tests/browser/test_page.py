@@ -321,54 +321,6 @@ def test_a_report_tells_of_days_of_changes_and_of_accuracy(browser, tmp_path):
         says(page, "#until", "17/11/2026")
 
 
-def test_a_layer_is_read_once_for_each_map_and_again_after_an_error(page, mapped):
-    maps_read, plans_read = [], []
-
-    def plan(route):
-        plans_read.append(route)
-        moved = {"kind": "moved", "path": "M-2 0L2 0", "text": "", "x": 0.0, "y": 0.0}
-        route.fulfill(status=500 if len(plans_read) == 1 else 200, body=json.dumps([moved]))
-
-    told = [{**one, "layers": ["plan"]} for one in httpx.get(f"{mapped.url}{API}/maps").json()]
-    page.route("**/api/v1/maps", lambda route: maps_read.append(route) or route.fulfill(body=json.dumps(told)))
-    page.route("**/api/v1/maps/0/layers/plan", plan)
-    page.goto(f"{mapped.url}#view=map")
-    until(page, lambda: has_map(page), "the map")
-    page.locator("#layers summary").click()
-    page.get_by_label("Floor plan").check()
-    until(page, lambda: pixels(page, [MOVED])[0] > 50, "the layer, after an error")
-    for _ in range(10):
-        page.locator("#layer-grid").click()
-        page.wait_for_timeout(50)
-    assert len(plans_read) <= len(maps_read) + 1  # which failed
-    edits, known = f"{mapped.url}{API}/edits", len(plans_read)
-    made = httpx.post(edits, json={"kind": "veto", "content": {"robot_i": "robot_1", "robot_j": "robot_3"}}).json()
-    httpx.post(f"{edits}/{made['number']}/undo")
-    until(page, lambda: len(plans_read) > known, "the layer of the new map")
-
-
-def test_a_layer_that_comes_late_is_not_laid_on_another_mission(page, mapped):
-    waiting, counts = [], httpx.get(f"{mapped.url}{API}/fleet").json()
-    moved = {"kind": "moved", "path": "M-2 0L2 0", "text": "", "x": 0.0, "y": 0.0}
-    told = [{**one, "layers": ["plan"]} for one in httpx.get(f"{mapped.url}{API}/maps").json()]
-    page.route("**/api/v1/maps", lambda route: route.fulfill(body=json.dumps(told)))
-    page.route("**/api/v1/maps/0/layers/plan", lambda route: waiting.append(route))  # noqa: PLW0108  Playwright marks it
-    page.goto(f"{mapped.url}#view=map")
-    until(page, lambda: has_map(page), "the map")
-    page.locator("#layers summary").click()
-    page.get_by_label("Floor plan").check()
-    until(page, lambda: len(waiting) == 1, "the first question")
-    page.route("**/api/v1/fleet", lambda route: route.fulfill(body=json.dumps({**counts, "mission": "another"})))
-    edits = f"{mapped.url}{API}/edits"
-    made = httpx.post(edits, json={"kind": "veto", "content": {"robot_i": "robot_1", "robot_j": "robot_3"}}).json()
-    httpx.post(f"{edits}/{made['number']}/undo")
-    says(page, "#mission", "another")
-    until(page, lambda: len(waiting) > 1, "the question about the other mission")
-    waiting[0].fulfill(body=json.dumps([moved]))
-    page.wait_for_timeout(500)
-    assert pixels(page, [MOVED]) == [0]
-
-
 def test_rounds_of_a_federated_training_are_listed(page, tmp_path):
     head = "round,version,released,robots,left_out,loss_triplet,mma_3px"
     (tmp_path / "learning").mkdir()
@@ -552,15 +504,6 @@ def test_a_connection_that_falls_silent_is_noticed(page, mapped):
     page.goto(mapped.url)
     says(page, "#status", "No connection to the service; trying again")
     page.unroute("**/api/v1/events")
-    says(page, "#status", "Live")
-
-
-def test_a_fault_of_the_service_is_said(page, mapped):
-    fault = {"error": "the disk is full or broken; free some space"}
-    page.route("**/api/v1/edits", lambda route: route.fulfill(status=507, body=json.dumps(fault)))
-    page.goto(mapped.url)
-    says(page, "#status", "the disk is full or broken; free some space; trying again")
-    page.unroute("**/api/v1/edits")
     says(page, "#status", "Live")
 
 

@@ -89,6 +89,7 @@ def test_the_ledger_books_what_geometry_says():
     confirmed = ledger.add(PlaceMatch.verified(line.i, line.j, Channel.CAMERA, 0.4, verified(line), predicted=False))
     assert confirmed.closure.status is ClosureStatus.VERIFIED
     assert ledger.evidence("a", "b") == ledger.evidence("b", "a") == [confirmed]
+    assert [ledger.has(line.i, line.j, channel) for channel in (Channel.CAMERA, Channel.LIDAR)] == [True, False]
     unconfirmed = replace(verified(line), strict=False)
     doubtful = ledger.add(PlaceMatch.verified(line.i, line.j, Channel.LIDAR, 0.4, unconfirmed, False))
     assert doubtful.closure.status is ClosureStatus.CANDIDATE
@@ -140,11 +141,3 @@ def test_a_solve_is_of_the_maps_whose_closures_changed_also_after_a_restart(tmp_
     assert not np.allclose(graph.trajectory("a"), a, atol=1e-3)
     assert np.allclose(graph.trajectory("c"), solved, atol=1e-9)
     assert all(np.array_equal(graph.trajectory(robot), again.trajectory(robot)) for robot in "abc")
-
-
-def test_a_closure_of_the_cameras_says_nothing_of_a_comparison_of_the_lidars():
-    log = ClosureLog()
-    (line,) = closures(("a", POSES), ("b", POSES), [(3, 4)])
-    log.add(PlaceMatch.verified(line.i, line.j, Channel.CAMERA, 0.4, verified(line), predicted=False))
-    assert log.has(line.i, line.j, Channel.CAMERA)
-    assert not log.has(line.i, line.j, Channel.LIDAR)

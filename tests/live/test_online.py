@@ -100,24 +100,6 @@ def test_the_cloud_gets_what_the_front_end_says(scans, alone, tmp_path):
     assert np.allclose(se2.between(CORRECTION.T_map_odom, poses[0]), 0.0, atol=1e-9)
 
 
-def test_an_outage_leaves_no_trace(scans, alone, tmp_path):
-    """The cloud is away until the recording is over; the front end never waits for it."""
-    cloud, back = FakeCloud(), threading.Event()
-
-    class Away(Network):
-        def _next(self):
-            self.requests += 1
-            return "none" if back.is_set() else "request lost"
-
-    def watch(now):
-        if now.scans == len(scans) and not back.is_set():
-            assert cloud.stored == {}
-            back.set()
-
-    drive(tmp_path, Away(cloud), scans, watch=watch)
-    assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(alone)]
-
-
 @pytest.mark.parametrize("stop", [1, 40])
 def test_a_robot_that_was_stopped_goes_on_in_the_same_epoch(scans, alone, tmp_path, stop):
     cloud = FakeCloud()
@@ -130,18 +112,6 @@ def test_a_robot_that_was_stopped_goes_on_in_the_same_epoch(scans, alone, tmp_pa
     assert list(cloud.stored) == [(0, k) for k in range(len(alone))]
     assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(alone)]
     assert seen[-1] is False
-
-
-def test_a_robot_that_starts_anew_has_a_new_epoch_and_the_old_one_is_not_lost(scans, alone, tmp_path):
-    cloud = FakeCloud()
-    with pytest.raises(KeyboardInterrupt):
-        drive(tmp_path, Network(cloud, ["request lost"] * 99), stop_after(scans, 40))
-    assert cloud.stored == {}
-    drive(tmp_path, Network(cloud), scans)
-    epochs = [epoch for epoch, _ in cloud.stored]
-    assert epochs.count(1) == len(alone)
-    assert 0 < epochs.count(0) < len(alone)
-    assert epochs == sorted(epochs), "what was left goes first"
 
 
 def test_too_much_waiting_costs_places_and_then_time_but_no_keyscan(scans, alone, tmp_path, monkeypatch):

@@ -106,17 +106,6 @@ def test_map_and_trajectory_are_there_at_any_time(robot, scans):
     assert drawn.cells[row, column] == fcslam.Occupancy.FREE, "where the robot stands"
 
 
-def test_poses_do_not_wait_for_the_worker(scans):
-    executor = SameThread()
-    with fcslam.Robot("anna", scans[0].laser, wiring=Wiring(executor)) as robot:
-        executor.holds = True
-        poses = drive(robot, scans)
-        assert [pose.map_index for pose in poses] == [None] * len(scans)
-        executor.holds = False
-        executor.work()
-        assert len(robot.trajectory().stamps) == len(scans)
-
-
 def test_without_a_scan_there_is_nothing_to_save(robot, tmp_path):
     with pytest.raises(InputError, match="no scan was added"):
         robot.save(tmp_path / "run")

@@ -68,31 +68,25 @@ REFUSED_BODIES = [
     (hello(angle_min_rad=NAN), "angle_min_rad"),
     (hello(angle_increment_rad=0.0), "do not turn"),
     (hello(angle_increment_rad=NAN), "increment_rad"),
-    (hello(beam_count=1, angle_increment_rad=-6.3), "angle_increment_rad"),
     (hello(angle_increment_rad=-0.036), "over a full turn"),
     (hello(max_range_m=0.0), "max_range_m"),
     (hello(max_range_m=INF), "max_range_m"),
     (hello(T_base_laser=(0.0, NAN, 0.0)), "T_base_laser"),
-    (hello(T_base_laser=(0.0, 0.0, 6.3)), "angle"),
     (replace(KEYSCAN, id=KeyscanId("bob", 0)), "holds a record of robot"),
-    (replace(KEYSCAN, id=KeyscanId("alice", -1)), "number"),
     (replace(KEYSCAN, id=KeyscanId("alice", 2**31)), "number"),
     (replace(KEYSCAN, stamp=NAN), "stamp is not finite"),
     (replace(KEYSCAN, stamp=1042.75), "later than"),
     (replace(VARIED_KEYSCAN, ranges_m=np.zeros(0, np.float32)), "0 ranges of 14 beams"),
     (replace(KEYSCAN, ranges_m=np.zeros(4097, np.float32)), "4097 ranges"),
-    (replace(KEYSCAN, ranges_m=np.zeros((2, 2), np.float32)), "shape"),
     (replace(KEYSCAN, ranges_m=np.array([1.001], np.float32)), "not quantised"),
     (replace(KEYSCAN, ranges_m=np.array([NAN], np.float32)), "not quantised"),
     (replace(KEYSCAN, laser=8), "laser is 8"),
     (beams(count=13), "14 ranges of 13 beams"),
     (beams(increment=0.5), "over a full turn"),
     (replace(CLOSURE, i=12), "not below"),
-    (replace(CLOSURE, i=-1), "i is -1"),
     (replace(CLOSURE, T_i_j=np.array([0.0, 0.0, 3.2])), "angle"),
     (replace(CLOSURE, T_i_j=np.array([1.1e6, 0.0, 0.0])), "not within"),
     (replace(CLOSURE, T_i_j=np.zeros(4)), "shape"),
-    (replace(CLOSURE, information=np.eye(4)), "shape"),
     (replace(CLOSURE, information=information(1.0, NAN, 1.0)), "not finite"),
     (replace(CLOSURE, information=information(1.0, 1.2e12, 1.0)), "diagonal"),
     (replace(CLOSURE, information=information(1.0, 9e-7, 1.0)), "diagonal"),
@@ -101,11 +95,9 @@ REFUSED_BODIES = [
     (replace(CLOSURE, information=information(1.0, 1.0, 1.0, xy=1.5)), "positive definite"),
     (replace(CLOSURE, information=information(1e4, 1e4, 1.0, xy=1e4 * (1.0 - 5e-7))), "clearly positive definite"),
     (replace(LIDAR_PLACE, first=13), "after last"),
-    (replace(LIDAR_PLACE, first=-1), "first is -1"),
     (replace(LIDAR_PLACE, detector_version=""), "detector version"),
     (place(2049), "2049 keypoints"),
     (place(2, codes=np.zeros((3, 32), np.uint8)), "descriptors have shape"),
-    (place(2, codes=np.zeros((2, 32), np.float32)), "not bytes"),
     (place(2, positions=np.zeros((2, 3), np.float32)), "keypoints have shape"),
     (place(1, positions=np.array([[327.7, 0.0]], np.float32)), "not within"),
     (place(1, positions=np.array([[0.0, NAN]], np.float32)), "not within"),
@@ -114,7 +106,6 @@ REFUSED_BODIES = [
     (replace(CORRECTION, quality=1.01), "quality"),
     (replace(CORRECTION, quality=NAN), "quality"),
     (replace(CORRECTION, T_map_odom=np.array([NAN, 0.0, 0.0])), "not within"),
-    (replace(ACKNOWLEDGEMENT, epoch=-1), "epoch"),
     (replace(ACKNOWLEDGEMENT, sequence=2**63), "sequence"),
     (detector_update(version="a b"), "detector version"),
     (detector_update(format=-1), "format"),
@@ -263,19 +254,14 @@ LIDAR, CAMERA = pb.Detector(channel=1, version="a"), pb.Detector(channel=2, vers
         ("keyscan_fix", {"sigma_m": 0.0}, "sigma_m is"),
         ("keyscan_fix", {"antenna_x_m": 2e3}, "antenna"),
         ("correction", {"t_map_odom": None}, "t_map_odom is missing"),
+        ("correction", {"version": 2**31}, "version"),
+        ("correction", {"map_index": 2**31}, "map_index"),
         ("detector_update", {"size": 2**63}, "file.size"),
     ],
 )
 def test_a_message_beyond_a_limit_is_not_read(name, fields, reason):
     with pytest.raises(PacketError, match=reason):
         decode(changed(name, **fields))
-
-
-def test_numbers_beyond_a_limit_are_not_read():
-    for body, reason in [(pb.Correction(version=2**31), "version"), (pb.Correction(map_index=2**31), "map_index")]:
-        body.t_map_odom.x_m = 1.0
-        with pytest.raises(PacketError, match=reason):
-            decode(pb.Packet(version=VERSION, robot="alice", correction=body).SerializeToString())
 
 
 def test_only_whole_known_messages_are_read():

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fcslam.wire.quantisation import (
-    MAXIMUM_RANGE_M,
     RANGE_STEP_M,
     dequantise,
     dequantise_keypoints,
@@ -40,10 +39,6 @@ def test_what_is_no_range_is_zero(missing):
 
 def test_no_return_differs_from_an_invalid_range():
     assert dequantise(quantise([np.inf, np.nan, 1.0])).tolist() == [np.inf, 0.0, 1.0]
-
-
-def test_the_longest_range():
-    assert quantise([MAXIMUM_RANGE_M]) == 65534
 
 
 @given(hnp.arrays(np.int16, (20, 3), elements=st.integers(-32767, 32767)))

@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fcslam.errors import PacketError
-from fcslam.features.birdseye import describe
-from fcslam.wire.quantisation import quantise_keypoints
 from fcslam.wire.streams import (
     ascending,
     pack_descriptors,
@@ -60,17 +58,6 @@ def test_any_descriptors_come_back(count, seed):
     packed = pack_descriptors(expected)
     assert len(packed) <= 32 * count
     assert np.array_equal(unpack_descriptors(packed, count), expected)
-
-
-def test_descriptors_of_rooms_take_three_quarters():
-    sides = np.linspace(-1.0, 1.0, 120)
-    wall = np.concatenate([np.stack(side, axis=1) for side in ((sides, sides**0), (sides**0, sides))])
-    walls = [k * np.array([1.5, 1.0]) * sign * wall for k in range(1, 7) for sign in (-1.0, 1.0)]
-    found = describe(np.concatenate(walls))
-    expected = found.descriptors[ascending(quantise_keypoints(found.keypoints_m))]
-    packed = pack_descriptors(expected)
-    assert len(packed) < 24 * len(expected)
-    assert np.array_equal(unpack_descriptors(packed, len(expected)), expected)
 
 
 UNPACK = {
