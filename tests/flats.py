@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from fcslam.sources.faults import Faults
-from tests.lidar.worlds import box, drifting, drive, path, recording
+from tests.lidar.worlds import Recording, box, drifting, drive, path, recording
 
 WALLS = np.vstack(
     (
@@ -56,17 +55,10 @@ def doors(count=16, period_m=2.5):
     return np.vstack(sides)
 
 
-class Drive:
+class Drive(Recording):
     """A recording of one robot that drives through a drawn world, with drifting odometry."""
 
-    faults = Faults({})
-
     def __init__(self, name, waypoints, segments, seed=0, **options):
-        poses = drive(waypoints)
-        self.name, self.poses = name, poses
-        odometry = drifting(poses, np.random.default_rng(seed), scale=1.005, veer_rad_m=0.002, noise=0.003)
-        self._scans = recording(poses, odometry, segments, seed=seed, **options)
-
-    def records(self):
-        """Its scans."""
-        yield from self._scans
+        self.poses = drive(waypoints)
+        odometry = drifting(self.poses, np.random.default_rng(seed), scale=1.005, veer_rad_m=0.002, noise=0.003)
+        super().__init__(recording(self.poses, odometry, segments, seed=seed, **options), name)

@@ -238,11 +238,6 @@ def test_a_map_that_is_written_is_read_back():
     assert not read.cells.flags.writeable
 
 
-def test_a_comment_as_other_programs_write_it_is_skipped():
-    commented = PGM.replace(b"P5\n", b"P5\n# CREATOR: map_saver 0.050 m/pix\n", 1)
-    assert np.array_equal(parse_map("map.pgm", commented, DESCRIPTION).cells, MAP.cells)
-
-
 @pytest.mark.parametrize(
     "pgm",
     [b"", b"P5", b"P2" + PGM[2:], PGM[:-1], PGM + b"\0", PGM.replace(b"4 7", b"0 7"), PGM.replace(b"4 7", b"-4 -7"),

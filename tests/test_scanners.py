@@ -1,7 +1,5 @@
 """Scanners whose beams vary, and several on one robot, from the sensor to the map."""
 
-from dataclasses import dataclass, field
-
 import numpy as np
 import pytest
 
@@ -9,9 +7,8 @@ from fcslam.geometry import se2
 from fcslam.maps.occupancy_map import Occupancy, parse_map
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import Beams, LaserModel, LaserScan, frozen
-from fcslam.sources.faults import Faults
 from fcslam.wire.messages import Hello
-from tests.lidar.worlds import box, drifting, drive, path, pose_errors, ranges, ring, ring_drive
+from tests.lidar.worlds import Recording, box, drifting, drive, path, pose_errors, ranges, ring, ring_drive
 
 pytestmark = pytest.mark.slow
 
@@ -27,18 +24,6 @@ def interleaved(number):
 def jittering(number):
     count = 360 + (7 * number) % 23 - 11
     return TURN.with_beams(Beams(count - (number % 5 == 0), -np.pi, 2.0 * np.pi / count))
-
-
-@dataclass(frozen=True)
-class Recording:
-    """A recording in memory."""
-
-    scans: list
-    name: str = "r"
-    faults: Faults = field(default_factory=lambda: Faults({}))
-
-    def records(self):
-        return iter(self.scans)
 
 
 def recorded(poses, odometry, world, laser_of):

@@ -34,12 +34,6 @@ def test_the_grid_finds_what_comparing_all_pairs_finds(side, whole):
     assert np.array_equal(box_nms(points[kept], side), np.arange(len(kept)))
 
 
-def test_on_whole_pixels_it_is_the_known_footprint():
-    """Side 4: (3, 1) away is too near, (3, 2) and (4, 0) are not."""
-    for offset, stays in [((3, 1), False), ((2, 2), False), ((3, 2), True), ((4, 0), True), ((0, 0), False)]:
-        assert len(box_nms([(10, 10), (10 + offset[0], 10 + offset[1])], 4)) == 1 + stays
-
-
 def test_side_zero_keeps_everything_and_nothing_stays_nothing():
     assert box_nms([(1, 1), (1, 1)], 0).tolist() == [0, 1]
     assert box_nms(np.empty((0, 2)), 4).tolist() == []

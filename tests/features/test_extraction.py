@@ -6,9 +6,8 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.errors import FeatureError
-from fcslam.features.classical import Orb, make_detector
-from fcslam.features.detector import NO_FEATURES, OnnxConfig
-from fcslam.features.detector_kinds import DetectorKind
+from fcslam.features.classical import Orb
+from fcslam.features.detector import NO_FEATURES
 from fcslam.features.files import extract, read_features, read_grey, write_features
 from tests.features.networks import tiny_network
 from tests.features.pictures import picture
@@ -162,16 +161,3 @@ def test_taking_some_takes_all_that_is_known_of_them(image):
     assert np.array_equal(some.scores, features.scores[[5, 2]])
     assert not some.descriptors.flags.writeable
     assert len(NO_FEATURES.take(slice(3)).scores) == 0
-
-
-def test_the_strongest_keypoints_of_all_scales_are_kept(images, tmp_path):
-    tiny_network(tmp_path / "n.onnx")
-    grey = read_grey(images / "grey.png")
-
-    def found(*scales):
-        config = OnnxConfig(weights=tmp_path / "n.onnx", most_features=50, scales=scales)
-        return make_detector(DetectorKind.ONNX, config).detect(grey)
-
-    one, half, both = found(1.0), found(0.5), found(1.0, 0.5)
-    assert half.scores.max() <= 0.5
-    assert np.array_equal(both.scores, np.sort(np.concatenate((one.scores, half.scores)))[::-1][:50])

@@ -8,7 +8,7 @@ from fcslam.features.lidar_depth import project as to_pixels
 from fcslam.geometry import se2
 from fcslam.records import CameraModel, Transform
 from tests.features.pictures import CAMERA
-from tests.lidar.worlds import LASER, box, path, room, scan_at
+from tests.lidar.worlds import LASER, box, cast, path, room, scan_at
 
 POSE = np.array([-1.5, -1.0, 0.2])
 
@@ -32,24 +32,12 @@ def seen_in(scan):
 
 
 def on_walls(pose, walls, angles_rad, heights):
-    """Points (K, 3) in ``base`` where level rays from the camera meet a wall, the nearest by brute force."""
-    eye = se2.transform(pose, np.array([CAMERA.T_base_camera.translation_m[:2]]))[0]
-    points = []
-    for angle, height in zip(angles_rad, heights, strict=True):
-        direction = np.array([np.cos(pose[2] + angle), np.sin(pose[2] + angle)])
-        ends = [cross(eye, direction, wall) for wall in walls]
-        distance = min(end for end in ends if end is not None)
-        points.append([*se2.transform(se2.inverse(pose), (eye + distance * direction)[None])[0], height])
-    return np.array(points)
-
-
-def cross(eye, direction, wall):
-    start, along = wall[:2], wall[2:] - wall[:2]
-    matrix = np.column_stack((direction, -along))
-    if abs(np.linalg.det(matrix)) < 1e-9:
-        return None
-    distance, share = np.linalg.solve(matrix, start - eye)
-    return distance if distance > 0 and 0 <= share <= 1 else None
+    """Points (K, 3) in ``base`` where level rays from the camera meet the nearest wall."""
+    eye = np.array(CAMERA.T_base_camera.translation_m[:2])
+    distances = cast(se2.transform(pose, eye[None]), pose[2] + angles_rad, walls)
+    return np.column_stack(
+        (eye + distances[:, None] * np.column_stack((np.cos(angles_rad), np.sin(angles_rad))), heights)
+    )
 
 
 @pytest.mark.parametrize("pose", [POSE, np.array([2.0, 1.0, -2.4]), np.array([0.0, 3.0, 1.7])])

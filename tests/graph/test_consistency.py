@@ -174,24 +174,19 @@ def test_consistency_ignores_the_frames_and_the_order() -> None:
     assert np.mean(forward != backward) < 0.01
 
 
-def test_covariance_is_in_the_frame_of_j() -> None:
+@pytest.mark.parametrize(("shift", "agrees"), [((0.3, 0.0, 0.0), True), ((0.0, 0.3, 0.0), False)])
+@pytest.mark.parametrize("turned", ["closures", "path"])
+def test_covariance_is_in_the_frame_of_j_and_turns_with_the_path(turned, shift, agrees) -> None:
     """Two closures that differ by 0.3 m along j's x, where the covariance is wide, agree; along y they do not."""
-    wide = np.linalg.inv(np.diag([0.25, 1e-4, 1e-6]))
-    turned = np.array([0.0, 0.0, np.pi / 2])
-    for shift, agrees in (((0.3, 0.0, 0.0), True), ((0.0, 0.3, 0.0), False)):
-        T = np.stack((turned, se2.compose(turned, shift)))
-        closures = Closures(np.array([0, 0]), np.array([0, 0]), T, np.stack((wide, wide)))
-        assert bool(pairwise_consistency(STILL, STILL, closures)[0, 1]) is agrees
-
-
-def test_covariance_turns_with_the_path_between_the_closures() -> None:
-    """As above, with the second closure at a keyscan that is turned against the first one's: its x is wide."""
-    tight, wide = np.linalg.inv(np.diag([1e-4, 1e-4, 1e-6])), np.linalg.inv(np.diag([0.25, 1e-4, 1e-6]))
-    b = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2)])
-    for shift, agrees in (((0.3, 0.0, 0.0), True), ((0.0, 0.3, 0.0), False)):
-        T = np.stack((b[0], se2.compose(b[1], shift)))
-        closures = Closures(np.array([0, 0]), np.array([0, 1]), T, np.stack((tight, wide)))
-        assert bool(pairwise_consistency(STILL, path_of(b), closures)[0, 1]) is agrees
+    wide, tight = np.linalg.inv(np.diag([0.25, 1e-4, 1e-6])), np.linalg.inv(np.diag([1e-4, 1e-4, 1e-6]))
+    still, quarter = np.zeros(3), np.array([0.0, 0.0, np.pi / 2])
+    if turned == "closures":
+        path, j, first, information = STILL, [0, 0], quarter, (wide, wide)
+    else:
+        path, j, first, information = path_of(np.stack((still, quarter))), [0, 1], still, (tight, wide)
+    T = np.stack((first, se2.compose(quarter, shift)))
+    closures = Closures(np.array([0, 0]), np.array(j), T, np.stack(information))
+    assert bool(pairwise_consistency(STILL, path, closures)[0, 1]) is agrees
 
 
 def test_as_many_closures_from_fewer_places_lead_nothing() -> None:

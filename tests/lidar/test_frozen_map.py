@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from fcslam.errors import SourceError
-from fcslam.geometry import se2
 from fcslam.lidar.frozen_map import frozen_map
 from fcslam.lidar.submap import agreement
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
@@ -50,15 +49,6 @@ def test_free_space_is_where_the_map_is_free():
     area = free.cells.sum() * 0.01
     assert area == pytest.approx(8.0 * 6.0, rel=0.05)
     assert np.allclose(free.corner, CORNER)
-
-
-def test_a_moved_map_gives_moved_walls():
-    occupancy = room()
-    shifted = OccupancyMap(occupancy.cells, occupancy.resolution_m, (CORNER[0] + 2.0, CORNER[1] - 1.0))
-    one, other = (frozen_map(grid, "room").surface.points for grid in (occupancy, shifted))
-    assert len(one) == pytest.approx(len(other), rel=0.05)
-    nearest = np.abs(se2.transform((2.0, -1.0, 0.0), one)[:, None] - other[None]).sum(axis=2).min(axis=1)
-    assert nearest.max() < 0.11  # the first surfel of each cell of 0.1 m is another one
 
 
 def test_what_cannot_be_used_is_told():

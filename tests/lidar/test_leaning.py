@@ -75,12 +75,6 @@ def lane(radius_m, half_m=6.0):
     return np.concatenate((right, left)) + np.repeat([(half_m, 0.0), (-half_m, 0.0)], len(right), axis=0)
 
 
-def test_a_round_room_is_no_floor():
-    poses = np.array([(0.0, 0.0, 0.35 * k) for k in range(120)])
-    level = replace(LASER, T_base_laser=(0.0, 0.0, 0.0))
-    assert floor_line(worlds.recording(poses, poses, worlds.path(*circle(2.5)), level)) is None
-
-
 @pytest.mark.parametrize("outline", [circle, lane])
 def test_the_wall_of_a_lane_and_of_a_round_building_is_mapped(tmp_path, outline):
     walls = np.vstack([worlds.path(*outline(radius_m), closed=True) for radius_m in (1.8, 4.5)])

@@ -8,6 +8,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast, cast_periods, classify
 from fcslam.maps.occupancy_map import Occupancy
 from fcslam.records import LaserModel
+from tests.lidar.worlds import box, ranges
 
 pytestmark = pytest.mark.slow
 
@@ -24,10 +25,7 @@ beam = st.tuples(coordinate, coordinate, st.floats(-np.pi, np.pi), st.floats(0.0
 
 def room_ranges(T_map_base, laser=ALL_ROUND, half=HALF_ROOM_M):
     """Ranges in a square room around the origin of map."""
-    x, y, heading = se2.compose(T_map_base, laser.T_base_laser)
-    way = np.stack((np.cos(heading + laser.angles_rad()), np.sin(heading + laser.angles_rad())))
-    with np.errstate(divide="ignore"):
-        return ((half - np.sign(way) * np.array([[x], [y]])) / np.abs(way)).min(axis=0).astype(np.float32)
+    return ranges(T_map_base, box(-half, -half, half, half), laser)[0]
 
 
 def room_scans(laser=ALL_ROUND, count=12, seed=3):
@@ -95,31 +93,6 @@ def test_beams_along_edges_and_through_corners_end(heading, start):
     assert ndimage.label(grid.passes)[1] == 1
 
 
-@settings(max_examples=20)
-@given(st.integers(-4000, 4000), st.integers(-4000, 4000))
-def test_moving_every_pose_by_whole_cells_moves_the_grid(columns, rows):
-    scans = room_scans(count=3)
-    shift = np.array((columns, rows, 0.0)) * CELL_M
-    shifted = [scan._replace(T_map_base=scan.T_map_base + shift) for scan in scans]
-    grid, moved = cast(scans, CONFIG), cast(shifted, CONFIG)
-    np.testing.assert_allclose(np.subtract(moved.origin_xy, grid.origin_xy), shift[:2], atol=1e-12)
-    assert moved.hits.shape == grid.hits.shape
-    # The sums round differently once in a blue moon: a beam end on an edge may change its cell.
-    assert (moved.hits != grid.hits).sum() <= 4
-    assert (moved.passes != grid.passes).sum() <= 8
-
-
-def test_counts_of_all_keyscans_are_the_sum_of_each():
-    scans = room_scans(count=3) + room_scans(FRONT, count=2)
-    whole = cast(scans, CONFIG)
-    total = np.zeros(whole.passes.shape, np.int64)
-    for part in (cast([scan], CONFIG) for scan in scans):
-        offset = np.rint(np.subtract(part.origin_xy, whole.origin_xy) / CELL_M).astype(int)
-        height, width = part.passes.shape
-        total[offset[1] : offset[1] + height, offset[0] : offset[0] + width] += part.passes
-    np.testing.assert_array_equal(whole.passes, total)
-
-
 def test_a_square_room_is_closed_and_free_inside():
     grid = cast(room_scans(), CONFIG)
     cells = classify(grid)
@@ -183,13 +156,7 @@ def states(castings, config=CONFIG):
     """The state of the cell at any (x, y)."""
     grid = cast(castings, config)
     cells = classify(grid)
-
-    def at(x, y):
-        column, row = (int(np.floor((v - o) / CELL_M)) for v, o in zip((x, y), grid.origin_xy, strict=True))
-        inside = 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]
-        return Occupancy(cells[row, column]) if inside else Occupancy.UNKNOWN
-
-    return at
+    return lambda x, y: state_at(grid, cells, x, y)
 
 
 @pytest.mark.parametrize("longest_m", [2.0, 30.0])
@@ -261,19 +228,24 @@ def test_a_person_who_left_is_cleared_by_beams_without_return(later):
     assert (cells[row - 3 : row + 4, column - 3 : column + 4] == Occupancy.FREE).all()
 
 
+def assert_wall_stays(near, far, half_m):
+    """In one period and in two, the wall at y = 3 is occupied, and nothing behind it is free."""
+    for periods in ([near + far], [near, far]):
+        *_, grid = cast_periods(periods, CONFIG)
+        cells = classify(grid)
+        (left, row), (right, _) = (
+            np.floor(np.subtract((x, 3.0), grid.origin_xy) / CELL_M).astype(int) for x in (-half_m, half_m)
+        )
+        assert (cells[row, left:right] == Occupancy.OCCUPIED).all()
+        assert not (cells[row + 1 :, left:right] == Occupancy.FREE).any()
+
+
 @pytest.mark.parametrize(("seen_from_m", "lost"), [(1.2, 0.0), (4.0, 0.05)], ids=["black", "lossy"])
 def test_a_wall_stays_whose_returns_are_missing_at_times(seen_from_m, lost):
     """A black wall returns no beam from afar, where the robot is most of the time; or any beam may fail."""
     near = [short_scan(-2.0 + 0.16 * k, 2.0, seen_from_m, lost, k) for k in range(25)]
     far = [short_scan(-2.0 + 0.04 * k, 0.5, seen_from_m, lost, k) for k in range(100)]
-    for periods in ([near + far], [near, far]):
-        *_, grid = cast_periods(periods, CONFIG)
-        cells = classify(grid)
-        row, left, right = (
-            int(np.floor(v / CELL_M)) for v in (3.0 - grid.origin_xy[1], -2 - grid.origin_xy[0], 2 - grid.origin_xy[0])
-        )
-        assert (cells[row, left:right] == Occupancy.OCCUPIED).all()
-        assert not (cells[row + 1 :, left:right] == Occupancy.FREE).any()
+    assert_wall_stays(near, far, 2.0)
 
 
 def test_a_black_panel_in_a_wall_stays_although_later_scans_see_only_the_wall_beside_it():
@@ -283,14 +255,7 @@ def test_a_black_panel_in_a_wall_stays_although_later_scans_see_only_the_wall_be
         scan = short_scan(-2.0 + 0.04 * k, 0.5)
         x = scan.T_map_base[0] + 2.5 / np.tan(np.clip(SHORT.angles_rad(), 0.1, np.pi - 0.1))
         far.append(scan._replace(ranges_m=np.where(np.abs(x) < 0.5, np.inf, scan.ranges_m).astype(np.float32)))
-    for periods in ([near + far], [near, far]):
-        *_, grid = cast_periods(periods, CONFIG)
-        cells = classify(grid)
-        (left, row), (right, _) = (
-            np.floor(np.subtract((x, 3.0), grid.origin_xy) / CELL_M).astype(int) for x in (-1.5, 1.5)
-        )
-        assert (cells[row, left:right] == Occupancy.OCCUPIED).all()
-        assert not (cells[row + 1 :, left:right] == Occupancy.FREE).any()
+    assert_wall_stays(near, far, 1.5)
 
 
 def test_the_grid_ends_where_beams_without_return_do():
@@ -312,12 +277,6 @@ def test_a_grid_too_large_gets_coarser_instead():
     assert grid.resolution_m > CELL_M
     assert grid.hits.sum() == 4 * ALL_ROUND.beam_count
     assert cast(scans, small).resolution_m == CELL_M
-
-
-def test_no_keyscans_make_one_unknown_cell():
-    grid = cast([], CONFIG)
-    assert grid.passes.tolist() == [[0]]
-    assert classify(grid).tolist() == [[Occupancy.UNKNOWN]]
 
 
 @pytest.mark.parametrize("pose", [(np.nan, 0, 0), (0, np.inf, 0), (0, 0, np.nan), (0, 0, np.inf), (1e12, 0, 0)])
@@ -358,7 +317,8 @@ POSES_INSIDE = np.random.default_rng(4).uniform((-0.7, -0.7, -3.0), (0.7, 0.7, 3
 
 def state_at(grid, cells, x, y):
     column, row = np.floor((np.array((x, y)) - grid.origin_xy) / grid.resolution_m).astype(int)
-    return Occupancy(cells[row, column])
+    inside = 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]
+    return Occupancy(cells[row, column]) if inside else Occupancy.UNKNOWN
 
 
 @pytest.mark.parametrize("earlier", [1, 5])

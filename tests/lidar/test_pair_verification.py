@@ -106,30 +106,24 @@ def test_a_submap_is_sent_once_however_often_it_is_built(pairs):
     assert 0 < len(sent) == len(set(sent))
 
 
-def gone(function, arguments):
+def gone(*_):
     raise BrokenExecutor("it is gone")
 
 
-def dies(function, arguments):
-    future = Future()
-    future.set_exception(ConnectionError("it died"))
-    return future
+def ending(end):
+    """An executor whose futures end so; ``end`` is given the future and the batch."""
+
+    def submit(_function, arguments):
+        end(future := Future(), arguments[0])
+        return future
+
+    return submit
 
 
-def is_cancelled(function, arguments):
-    future = Future()
-    future.cancel()
-    return future
-
-
-def stays_away(function, arguments):
-    return Future()
-
-
-def forgets(function, arguments):
-    future = Future()
-    future.set_result(list(arguments[0]))
-    return future
+dies = ending(lambda future, _: future.set_exception(ConnectionError("it died")))
+is_cancelled = ending(lambda future, _: future.cancel())
+stays_away = ending(lambda *_: None)
+forgets = ending(lambda future, batch: future.set_result(list(batch)))
 
 
 @pytest.mark.parametrize("fails", [gone, dies, is_cancelled, stays_away, forgets])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from fcslam.geometry import se2
 from fcslam.lidar.scan import point_scan
 from fcslam.records import LaserModel, frozen
-from tests.lidar.worlds import LASER, MAX_RANGE_M, bare_scan, path, ranges, room, scan_at
+from tests.lidar.worlds import LASER, MAX_RANGE_M, bare_scan, path, room, scan_at
 
 
 def clear_of_ends(points, segments, margin_m):
@@ -56,17 +56,6 @@ def test_only_returns_become_points(found):
     np.testing.assert_allclose(scan.points, np.column_stack((r * np.cos(angle), r * np.sin(angle))), atol=1e-9)
     assert len(scan) == len(valid) == len(scan.normals)
     assert np.isfinite(scan.normals).all()
-
-
-@pytest.mark.parametrize("mount", [(0.3, 0.0, 0.0), (0.1, -0.2, 1.1), (-0.25, 0.05, np.pi)])
-def test_moving_the_mount_moves_the_points(mount):
-    found = ranges((0.5, 0.4, 0.2), room())[0]
-    plain = point_scan(found, LASER)
-    mounted = point_scan(
-        found, LaserModel(LASER.beam_count, LASER.angle_min_rad, LASER.angle_increment_rad, MAX_RANGE_M, mount)
-    )
-    np.testing.assert_allclose(mounted.points, se2.transform(mount, plain.points), atol=1e-9)
-    np.testing.assert_allclose(mounted.normals, se2.transform((0, 0, mount[2]), plain.normals), atol=1e-6)
 
 
 def test_a_normal_does_not_bridge_a_gap():

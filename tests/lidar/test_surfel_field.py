@@ -13,10 +13,6 @@ HALF_DIAGONAL_M = CELL_M * np.sqrt(0.5)
 SIDE_M = TABLE * TILE * CELL_M
 
 
-def points_scan(points):
-    return bare_scan(points)
-
-
 def excess(field, queries):
     """How much farther the labelled surfel is than the nearest one; NaN where there is no label."""
     labels = field.nearest(queries)
@@ -32,7 +28,7 @@ def test_nearest_agrees_with_a_search_tree(seed):
     rng = np.random.default_rng(seed)
     points = np.unique(np.floor(rng.uniform(-30, 30, (60, 2))), axis=0) * 0.12 + rng.uniform(0, 0.05, 2)
     field = SurfelField(rng.uniform(-1, 1, 2))
-    field.insert(points_scan(points), np.zeros(3))
+    field.insert(bare_scan(points), np.zeros(3))
     np.testing.assert_allclose(field.points, points)
     queries = rng.uniform(-4.5, 4.5, (400, 2))
     rest, nearest = excess(field, queries)
@@ -52,14 +48,6 @@ def test_surfels_that_moved_stay_nearest_within_a_cell_or_two():
     assert not np.isnan(rest).any()
     assert np.quantile(rest, 0.99) < 2 * HALF_DIAGONAL_M
     assert rest.max() < 2 * HALF_DIAGONAL_M + 2 * MERGE_M
-
-
-def test_inserting_a_scan_twice_moves_nothing():
-    scan = scan_at((0.4, 0.3, 0.8), room()).thinned(2.5 * MERGE_M, 1000)
-    once, twice = field_of([(scan, np.zeros(3))]), field_of([(scan, np.zeros(3)), (scan, np.zeros(3))])
-    assert len(once.points) == len(scan)
-    np.testing.assert_allclose(twice.points, once.points, atol=1e-12)
-    np.testing.assert_allclose(twice.normals, once.normals, atol=1e-12)
 
 
 def test_a_dense_scan_again_and_again_neither_spreads_nor_multiplies():
@@ -96,10 +84,10 @@ def test_both_sides_of_a_wall_stay_apart(thickness_m):
 @pytest.mark.parametrize("far", [(SIDE_M, 0.0), (-SIDE_M, SIDE_M), (0.0, 1e7), (0.5 * SIDE_M - 0.2, 0.0)])
 def test_what_lies_outside_the_table_is_ignored(far):
     field = SurfelField(np.zeros(2))
-    field.insert(points_scan([(1.0, 1.0)]), np.zeros(3))
+    field.insert(bare_scan([(1.0, 1.0)]), np.zeros(3))
     before = field.points.copy()
     for _ in range(3):
-        field.insert(points_scan(np.zeros((5, 2))), np.array([*far, 0.0]))
+        field.insert(bare_scan(np.zeros((5, 2))), np.array([*far, 0.0]))
     np.testing.assert_array_equal(field.points, before)
     assert field.nearest(np.array([far])) == [EMPTY]
     assert field.nearest(np.array([(1.0, 1.0)])) == [0]

@@ -1,8 +1,5 @@
 """Beams that are measured while the robot moves: each is placed where the robot was, and matching finds the motion."""
 
-import ast
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,6 +9,8 @@ from fcslam.lidar.matching import FIXED, match_scan
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast
 from fcslam.lidar.scan import point_scan, rays_of
 from fcslam.records import LaserModel, Sweep
+from tests.lidar.worlds import box
+from tests.lidar.worlds import cast as cast_rays
 
 pytestmark = pytest.mark.slow
 
@@ -24,16 +23,12 @@ NO_PRIOR = np.zeros((3, 3))
 
 def ranges_in_room(T_room_base, sweep, laser=LASER):
     """Ranges to the walls, each from where the laser is at the time of its beam; the oracle of every test."""
-    count = laser.beam_count
-    ranges = np.empty(count)
-    for i in range(count):
-        t = 0.0 if sweep is None else sweep.first_s + (sweep.last_s - sweep.first_s) * i / (count - 1)
-        T_room_now = T_room_base if sweep is None else se2.compose(T_room_base, sweep.displacement(t))
-        x, y, heading = se2.compose(T_room_now, laser.T_base_laser)
-        angle = heading + laser.angle_min_rad + i * laser.angle_increment_rad
-        way = np.array((np.cos(angle), np.sin(angle)))
-        ranges[i] = ((np.sign(way) * HALF_M - (x, y)) / way).min()
-    return ranges.astype(np.float32)
+    T_room_laser = np.tile(se2.compose(T_room_base, laser.T_base_laser), (laser.beam_count, 1))
+    if sweep is not None:
+        moved = [sweep.displacement(t) for t in np.linspace(*sweep[:2], laser.beam_count)]
+        T_room_laser = se2.compose(se2.compose(T_room_base, np.array(moved)), laser.T_base_laser)
+    walls = box(*-HALF_M, *HALF_M)
+    return cast_rays(T_room_laser[:, :2], T_room_laser[:, 2] + laser.angles_rad(), walls).astype(np.float32)
 
 
 def distance_to_walls(points):
@@ -104,21 +99,6 @@ def test_occupancy_rays_begin_where_the_robot_was():
     assert distance_to_walls(hits).max() < 0.06
     rays = rays_of(LASER, SWEEP)
     assert np.linalg.norm(rays.origins[-1] - rays.origins[0]) > 0.05
-
-
-def test_one_function_turns_ranges_into_points():
-    """Directions of beams are computed in ``lidar.scan`` alone; simulators cast rays the other way round."""
-    source = Path(__file__).parents[2] / "src/fcslam"
-    allowed = {"records.py", "lidar/scan.py"}
-    found = set()
-    for path in source.rglob("*.py"):
-        name = path.relative_to(source).as_posix()
-        calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Attribute))
-        if any(node.attr == "angles_rad" for node in calls):
-            found.add(name)
-    without_points = {"warmup.py", "cluster/verifying.py", "sources/contradictions.py", "sources/returns.py"}
-    simulators = {name for name in found if name.startswith("lab/")}
-    assert found - simulators - without_points == allowed - {"records.py"}
 
 
 def test_a_turn_that_begins_within_a_scan_is_found_against_a_confident_prior():

@@ -7,6 +7,7 @@ import numpy as np
 from fcslam.geometry import se2
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import LaserModel, LaserScan, frozen
+from fcslam.sources.faults import Faults
 
 MAX_RANGE_M = 20.0
 LASER = LaserModel(360, -np.pi, np.deg2rad(1.0), MAX_RANGE_M)
@@ -67,24 +68,23 @@ def ring():
 def ranges(poses, segments, laser=LASER, noise_m=0.0, rng=None):
     """Ranges (N, B) from the base's poses (N, 3); ``max_range_m`` where a ray meets nothing."""
     rays = se2.compose(np.atleast_2d(poses), laser.T_base_laser)
-    found = np.stack([np.minimum(_nearest(ray, segments, laser), laser.max_range_m) for ray in rays])
+    # pose by pose: an array of all poses, beams and segments does not fit into the cache
+    found = np.stack([cast(ray[:2], ray[2] + laser.angles_rad(), segments) for ray in rays])
+    found = np.minimum(found, laser.max_range_m)
     if noise_m:
         found = np.where(found < laser.max_range_m, found + rng.normal(0, noise_m, found.shape), found)
     return np.minimum(found, laser.max_range_m).astype(np.float32)
 
 
-def _nearest(ray, segments, laser):
-    """Distance (B,) of the nearest segment from the laser's pose along each beam; infinite where there is none.
-
-    Pose by pose: an array of all poses, beams and segments does not fit into the cache.
-    """
-    angles = ray[2] + laser.angles_rad()
-    directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
-    start, side = segments[:, :2] - ray[:2], segments[:, 2:] - segments[:, :2]
-    scale = directions @ np.stack((side[:, 1], -side[:, 0]))
+def cast(origins, angles, segments):
+    """Distance of the nearest segment along each ray, from one origin or one for each; infinite where there is none."""
+    x, y = np.cos(angles)[:, None], np.sin(angles)[:, None]
+    side_x, side_y = (segments[:, 2:] - segments[:, :2]).T
+    start_x, start_y = np.moveaxis(segments[:, :2] - np.atleast_2d(origins)[:, None], -1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        along = (start[:, 0] * side[:, 1] - start[:, 1] * side[:, 0]) / scale
-        share = (directions @ np.stack((-start[:, 1], start[:, 0]))) / scale
+        scale = x * side_y - y * side_x
+        along = (start_x * side_y - start_y * side_x) / scale
+        share = (start_x * y - start_y * x) / scale
     hit = (along > 0) & (share >= 0) & (share <= 1)
     return np.where(hit, along, np.inf).min(axis=1)
 
@@ -130,6 +130,18 @@ def recording(poses, odometry, segments, laser=LASER, *, noise_m=0.015, seed=0):
         LaserScan(100.0 + 0.2 * k, frozen(row, np.float32), laser, frozen(pose))
         for k, (row, pose) in enumerate(zip(found, odometry, strict=True))
     ]
+
+
+class Recording:
+    """Scans in memory as the recording of a robot."""
+
+    faults = Faults({})
+
+    def __init__(self, scans, name="r"):
+        self.scans, self.name = scans, name
+
+    def records(self):
+        yield from self.scans
 
 
 def ring_drive(rounds=1.2):

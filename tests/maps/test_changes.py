@@ -7,6 +7,7 @@ from fcslam.maps.changes import compare
 from fcslam.maps.fusion import Period, fuse, fuse_periods, periods_of
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import Keyscan, KeyscanId, LaserModel
+from tests.lidar.worlds import box, ranges
 
 LASER = LaserModel(720, -np.pi, np.pi / 360, 30.0)
 HALF_M = 3.02
@@ -15,16 +16,8 @@ CONFIG = OccupancyConfig()
 
 def ranges_around(pose, boxes):
     """Ranges in a square room with square boxes (x, y, half side)."""
-    angle = pose[2] + LASER.angles_rad()
-    way = np.stack((np.cos(angle), np.sin(angle)))
-    with np.errstate(divide="ignore"):
-        found = ((HALF_M - np.sign(way) * pose[:2, None]) / np.abs(way)).min(axis=0)
-        for x, y, half in boxes:
-            entry = (np.array([[x], [y]]) - np.sign(way) * half - pose[:2, None]) / way
-            leave = (np.array([[x], [y]]) + np.sign(way) * half - pose[:2, None]) / way
-            near, far = entry.max(axis=0), leave.min(axis=0)
-            found = np.where((near > 0) & (near < far), np.minimum(found, near), found)
-    return found.astype(np.float32)
+    sides = [box(x - half, y - half, x + half, y + half) for x, y, half in ((0.0, 0.0, HALF_M), *boxes)]
+    return ranges(pose, np.vstack(sides), LASER)[0]
 
 
 def session(name, start_s, boxes, seed=0):
@@ -68,12 +61,6 @@ def test_a_box_that_moved_disappears_here_and_appears_there():
         assert region.sessions == ("a+1",)
     assert found.appeared.sum() * CONFIG.resolution_m**2 == pytest.approx(below.area_m2)
     assert not (found.appeared & found.disappeared).any()
-
-
-def test_the_session_of_a_region_is_the_one_that_saw_it_first():
-    boxes = [], [(1.0, 0.0, 0.3)], [(1.0, 0.0, 0.3)]
-    found = changed(*(session(f"a+{k}" if k else "a", 100.0 * k, box, k) for k, box in enumerate(boxes)))
-    assert [region.sessions for region in found.regions] == [("a+1",)]
 
 
 def test_nothing_changed_where_nothing_changed_or_nobody_looked():

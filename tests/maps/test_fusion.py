@@ -1,27 +1,19 @@
 import numpy as np
-import pytest
 import yaml
 
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.fusion import fuse
 from fcslam.maps.occupancy_map import Occupancy, map_yaml, pgm_bytes
 from fcslam.records import Keyscan, KeyscanId, LaserModel
+from tests.lidar.worlds import box, ranges
 
 CONFIG = OccupancyConfig()
 LASERS = {
     "a": (LaserModel(361, -np.pi, np.pi / 180, 30.0),),
     "b": (LaserModel(181, -np.pi / 2, np.pi / 180, 20.0, (0.2, 0.0, 0.0)),),
 }
-CORRIDOR = {"left": -1.02, "right": 6.03, "bottom": -0.73, "top": 2.48}  # no symmetry: a flip is seen
-
-
-def ranges_in_corridor(laser, pose):
-    x, y = (pose[0] + laser.T_base_laser[0] * np.cos(pose[2]), pose[1] + laser.T_base_laser[0] * np.sin(pose[2]))
-    angle = pose[2] + laser.T_base_laser[2] + laser.angles_rad()
-    with np.errstate(divide="ignore"):
-        across = np.where(np.cos(angle) > 0, CORRIDOR["right"] - x, CORRIDOR["left"] - x) / np.cos(angle)
-        along = np.where(np.sin(angle) > 0, CORRIDOR["top"] - y, CORRIDOR["bottom"] - y) / np.sin(angle)
-    return np.minimum(across, along).astype(np.float32)
+CORRIDOR = {"left": -1.02, "bottom": -0.73, "right": 6.03, "top": 2.48}  # no symmetry: a flip is seen
+WALLS = box(*CORRIDOR.values())
 
 
 def fleet():
@@ -29,7 +21,8 @@ def fleet():
     keyscans = []
     for k, pose in enumerate(poses):
         robot = "ab"[k % 2]
-        keyscans.append(Keyscan(KeyscanId(robot, k // 2), float(k), ranges_in_corridor(LASERS[robot][0], pose)))
+        seen = ranges(pose, WALLS, LASERS[robot][0])[0]
+        keyscans.append(Keyscan(KeyscanId(robot, k // 2), float(k), seen))
     return keyscans, poses
 
 
@@ -93,13 +86,3 @@ def test_the_image_name_survives_yaml():
     for name in ("map.pgm", "map 1: yes.pgm", "no", "#x.pgm"):
         assert yaml.safe_load(map_yaml(fused, name))["image"] == name
     assert pgm_bytes(fused) == b"P5\n1 1\n255\n\xcd"
-
-
-def test_what_does_not_fit_is_refused():
-    keyscans, poses = fleet()
-    with pytest.raises(ValueError, match="zip"):
-        fuse(keyscans, poses[:-1], LASERS, CONFIG)
-    with pytest.raises(KeyError, match="b"):
-        fuse(keyscans, poses, {"a": LASERS["a"]}, CONFIG)
-    with pytest.raises(ValueError, match="finite"):
-        fuse(keyscans, np.full((9, 3), np.nan), LASERS, CONFIG)

@@ -54,10 +54,6 @@ def test_every_zoom_shows_the_map(grid, tmp_path, zoom):
     assert off.mean() < 12.0
 
 
-def test_a_square_kilometre_is_seen_in_at_most_twelve_tiles():
-    assert (int(np.ceil(1000.0 / WORLD_M)) + 1) ** 2 <= 12
-
-
 def test_no_zoom_is_finer_than_the_cells():
     assert WORLD_M / TILE_PX / 2 ** finest_zoom(RESOLUTION_M) <= RESOLUTION_M
 

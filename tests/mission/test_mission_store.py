@@ -4,6 +4,7 @@ import contextlib
 import os
 import secrets
 import sqlite3
+import sys
 import threading
 from dataclasses import replace
 
@@ -21,6 +22,7 @@ from fcslam.service.shared.registry import Registry
 from fcslam.storage.database import SealedConnection, seal
 from fcslam.storage.row_store import change_rows
 from fcslam.wire.messages import PacketKind
+from tests.full_disk import largest_file
 
 pytestmark = pytest.mark.slow
 
@@ -33,36 +35,24 @@ def packet(robot="a", epoch=0, sequence=0, data=None) -> StoredPacket:
     return StoredPacket(robot, epoch, sequence, 0.5 * sequence, PacketKind.PLACE, Channel.CAMERA, content)
 
 
-class FilePlace:
-    """A mission in a file."""
-
-    def __init__(self, folder):
-        self._path = folder / "mission.sqlite"
-
-    def open(self):
-        return MissionStore(self._path)
-
-
-class ServerPlace:
-    """A mission on a PostgreSQL server."""
-
-    def __init__(self, server):
-        self._server = server
-        self._number = Registry(server, "tests", "tests").create(f"m{secrets.token_hex(8)}")
-
-    def open(self):
-        return MissionStore(MissionTables(self._server, self._number))
+def place_of(kind, folder, request):
+    """Opens a mission in a file or on a PostgreSQL server."""
+    if kind == "file":
+        return lambda: MissionStore(folder / "mission.sqlite")
+    server = request.getfixturevalue("postgres")
+    number = Registry(server, "tests", "tests").create(f"m{secrets.token_hex(8)}")
+    return lambda: MissionStore(MissionTables(server, number))
 
 
 @pytest.fixture(params=["file", "server"])
 def place(request, tmp_path):
     """Each test of a store is one of both stores."""
-    return FilePlace(tmp_path) if request.param == "file" else ServerPlace(request.getfixturevalue("postgres"))
+    return place_of(request.param, tmp_path, request)
 
 
 @pytest.fixture
 def store(place):
-    store = place.open()
+    store = place()
     yield store
     store.close()
 
@@ -78,9 +68,8 @@ def stored(store):
 @given(batches=BATCHES)
 @pytest.mark.parametrize("kind", ["file", "server"])
 def test_packets_are_stored_once_in_the_order_of_their_arrival(kind, batches, tmp_path_factory, request):
-    is_file = kind == "file"
-    place = FilePlace(tmp_path_factory.mktemp("store")) if is_file else ServerPlace(request.getfixturevalue("postgres"))
-    store = place.open()
+    place = place_of(kind, tmp_path_factory.mktemp("store"), request)
+    store = place()
     expected: dict[tuple[str, int, int], None] = {}
     for batch in batches:
         new = store.put([packet(*number) for number in batch], received_s=1.0)
@@ -91,7 +80,7 @@ def test_packets_are_stored_once_in_the_order_of_their_arrival(kind, batches, tm
     assert [arrival for arrival, _ in arrivals] == list(range(1, len(expected) + 1))
     assert [e[:3] for e in store.envelopes()] == list(expected)
     store.close()
-    again = place.open()
+    again = place()
     assert again.arrivals(0, 1000) == arrivals
     again.close()
 
@@ -110,7 +99,7 @@ def test_another_packet_with_the_same_number_is_a_conflict_and_those_before_it_a
     assert [p.data for p in stored(store)] == [b"a 0 1", b"a 0 0"]
 
 
-def test_a_batch_that_fails_in_the_middle_leaves_nothing(store, monkeypatch):
+def test_a_batch_that_fails_in_the_middle_leaves_nothing(store):
     store.put([packet(sequence=0)], 0.0)
     with pytest.raises(StoreError, match=r"full|null value"):
         store.put([packet(sequence=1), replace(packet(sequence=2), data=None)], 0.0)  # type: ignore[arg-type]
@@ -122,19 +111,17 @@ def test_a_batch_that_fails_in_the_middle_leaves_nothing(store, monkeypatch):
 def test_a_full_disk_is_told_and_what_was_there_stays(tmp_path):
     store = MissionStore(tmp_path / "mission.sqlite")
     store.put([packet()], 0.0)
-    pages = store._database.value("PRAGMA page_count")
-    store._database.share(lambda database: database.execute(f"PRAGMA max_page_count={pages + 2}"))
-    with pytest.raises(StoreError, match="is the disk full"):
+    used = (tmp_path / "mission.sqlite-wal").stat().st_size
+    with largest_file(used + 10_000), pytest.raises(StoreError, match="is the disk full"):
         store.put([packet(sequence=k, data=bytes(4096)) for k in range(1, 9)], 0.0)
     assert stored(store) == [packet()]
-    store._database.share(lambda database: database.execute("PRAGMA max_page_count=100000"))
     store.put([packet(sequence=k, data=bytes(4096)) for k in range(1, 9)], 0.0)
     assert len(stored(store)) == 9
     store.close()
 
 
 def test_what_another_process_wrote_is_seen(store, place):
-    other = place.open()
+    other = place()
     other.put([packet()], 0.0)
     other.refuse("a", 0, 0, "no good")
     assert store.refusals("a") == [(0, 0, "no good")]
@@ -144,13 +131,13 @@ def test_what_another_process_wrote_is_seen(store, place):
 
 @pytest.mark.parametrize("reopened", [False, True])
 def test_versions_of_corrections_grow_with_every_change_and_with_nothing_else(place, reopened):
-    store = place.open()
+    store = place()
     told = []
     for x in (0.0, 0.0, 1.0, 1.0, 0.0):
         store.progress(5, [correction("a", x), correction("b", 3.0)])
         if reopened:
             store.close()
-            store = place.open()
+            store = place()
         versions = {robot: store.correction(robot, 0).correction.version for robot in "ab"}
         told.append((x, versions["a"], versions["b"]))
     assert [x for x, *_ in told] == [0.0, 0.0, 1.0, 1.0, 0.0]
@@ -291,12 +278,17 @@ def test_a_file_that_is_no_mission_is_refused(store, tmp_path, harm):
 
 def test_the_time_for_a_packet_does_not_grow_with_the_mission(tmp_path):
     """No statement that a packet or a reply to a robot needs reads all packets; SQLite calls that a scan."""
-    path = tmp_path / "mission.sqlite"
+    path, opened, statements = tmp_path / "mission.sqlite", [], []
+    sys.addaudithook(
+        lambda event, of: opened is not None and event == "sqlite3.connect/handle" and opened.append(of[0])
+    )
     store = MissionStore(path)
     store.put([packet(robot, sequence=k) for robot in "ab" for k in range(20)], 1.0)
-    statements = []
-    for connection in (store._database._connection, store._database._reading):
-        connection.set_trace_callback(statements.append)
+    connections, opened = opened, None
+    for connection in connections:
+        with contextlib.suppress(sqlite3.ProgrammingError):  # one that is closed
+            connection.set_trace_callback(statements.append)
+    del connection, connections
     store.put([packet(sequence=k) for k in range(15, 25)], 2.0)
     store.progress(40, [correction("a", 1.0)])
     store.arrivals(30, 10)

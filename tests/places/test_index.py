@@ -182,14 +182,6 @@ def test_before_the_first_training_nothing_is_found(strategy):
 
 
 @EVERY
-def test_eq_4_of_two_places_is_that_of_their_bags(strategy):
-    index, places = filled(strategy, Scoring.WORDS)
-    expected = words_oracle(index, places, places[2])
-    for other in (2, 5, 31):
-        assert similarity(index.bag(places[2]), index.bag(places[other])) == pytest.approx(expected[other], abs=1e-9)
-
-
-@EVERY
 @BOTH
 @pytest.mark.parametrize(
     "codes", [EMPTY, np.zeros((1, 32), np.uint8), np.zeros((200, 32), np.uint8)], ids=["none", "one", "equal"]

@@ -7,6 +7,7 @@ import numpy as np
 from fcslam.geometry import se2
 from fcslam.metrics.trajectory import align
 from fcslam.records import LaserModel, LaserScan, Sweep, frozen
+from tests.lidar.worlds import box, cast
 
 LASER = LaserModel(180, -np.pi, 2.0 * np.pi / 180, 12.0, (0.1, 0.0, 0.0))
 SCAN_S = 1.0 / 7.0
@@ -16,17 +17,8 @@ BEGIN_S = 100.0
 """Stamp at which the drive begins in a bag, as ROS takes 0 for no stamp."""
 
 
-def _box(x, y, width, depth):
-    return [
-        (x, y, x + width, y),
-        (x + width, y, x + width, y + depth),
-        (x + width, y + depth, x, y + depth),
-        (x, y + depth, x, y),
-    ]
-
-
-WALLS = np.array(
-    _box(-4.0, -3.0, 8.5, 9.2) + _box(1.5, 1.2, 0.8, 0.5) + _box(-2.6, -2.0, 0.5, 1.1) + _box(2.4, -2.3, 1.0, 0.4)
+WALLS = np.vstack(
+    (box(-4.0, -3.0, 4.5, 6.2), box(1.5, 1.2, 2.3, 1.7), box(-2.6, -2.0, -2.1, -0.9), box(2.4, -2.3, 3.4, -1.9))
 )
 
 
@@ -48,16 +40,8 @@ def pose_at(stamps):
 def ranges_at(stamps, rng, walls=WALLS):
     """A range for each beam, measured at its own time ``stamps`` (beam_count,)."""
     T_odom_laser = se2.compose(pose_at(stamps), LASER.T_base_laser)
-    origins, angles = T_odom_laser[:, :2], T_odom_laser[:, 2] + LASER.angles_rad()
-    ways = np.stack((np.cos(angles), np.sin(angles)), axis=1)
-    begins, edges = walls[:, :2], walls[:, 2:] - walls[:, :2]
-    offsets = begins[None] - origins[:, None]
-    cross = ways[:, None, 0] * edges[None, :, 1] - ways[:, None, 1] * edges[None, :, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = (offsets[..., 0] * edges[None, :, 1] - offsets[..., 1] * edges[None, :, 0]) / cross
-        share = (offsets[..., 0] * ways[:, None, 1] - offsets[..., 1] * ways[:, None, 0]) / cross
-    along[~((share >= 0.0) & (share <= 1.0) & (along > 0.0))] = np.inf
-    return (along.min(axis=1) + rng.normal(0.0, 0.005, len(angles))).astype(np.float32)
+    found = cast(T_odom_laser[:, :2], T_odom_laser[:, 2] + LASER.angles_rad(), walls)
+    return (found + rng.normal(0.0, 0.005, len(found))).astype(np.float32)
 
 
 def drive(seconds=20.0, states_sweep=True, odometry=None, begin_s=0.0, scan_s=SCAN_S, walls=WALLS):

@@ -27,16 +27,11 @@ def published(network):
     return Outputs(network, "/robot1", "map", "/tf")
 
 
-def test_a_map_that_stays_the_same_is_sent_once(network, published):
+def test_a_map_is_sent_again_if_it_changed(network, published):
     cells = np.full((4, 5), Occupancy.FREE)
     assert published.map(1, occupancy(cells))
     assert not published.map(2, occupancy(cells))
     assert len(network.sent["/robot1/map"]) == 1
-
-
-def test_a_map_that_changed_is_sent_again(network, published):
-    cells = np.full((4, 5), Occupancy.FREE)
-    published.map(1, occupancy(cells))
     cells = cells.copy()
     cells[1, 2] = Occupancy.OCCUPIED
     assert published.map(2, occupancy(cells))
@@ -61,19 +56,13 @@ def test_closures_and_diagnostics(network, published):
     assert (array.status[0].level, array.status[0].message) == (1, "lost")
 
 
-def test_the_path_is_thinned(network, published):
-    poses = np.column_stack((np.linspace(0.0, 1.0, 101), np.zeros((101, 2))))
-    published.path(1, np.arange(101.0), poses)
+@pytest.mark.parametrize(("length_m", "count", "least", "most"), [(1.0, 101, 8, 12), (1000.0, 20_001, 3900, 5200)])
+def test_the_path_is_thinned_and_a_long_one_has_longer_steps(network, published, length_m, count, least, most):
+    poses = np.column_stack((np.linspace(0.0, length_m, count), np.zeros((count, 2))))
+    published.path(1, np.arange(float(count)), poses)
     (path,) = network.sent["/robot1/path"]
-    assert len(path.poses) <= 12
-    assert path.poses[-1].pose.position.x == 1.0
-
-
-def test_a_long_path_has_longer_steps(network, published):
-    poses = np.column_stack((np.linspace(0.0, 1000.0, 20_001), np.zeros((20_001, 2))))
-    published.path(1, np.arange(20_001.0), poses)
-    (path,) = network.sent["/robot1/path"]
-    assert 3900 <= len(path.poses) <= 5200
+    assert least <= len(path.poses) <= most
+    assert path.poses[-1].pose.position.x == length_m
 
 
 def test_stamps_grow_between_scans_up_to_the_bound():

@@ -1,9 +1,7 @@
 """A recording of a network in memory is read as a bag; what is missing on a computer is said in one line."""
 
-import resource
 import sys
 import threading
-from contextlib import contextmanager
 
 import pytest
 
@@ -15,41 +13,33 @@ from fcslam.ros.record import record
 from fcslam.ros.ros2 import INSTALL, Ros2Network
 from fcslam.sources import BagOptions, open_source
 from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
+from tests.full_disk import largest_file
 from tests.ros.memory_network import MemoryNetwork, offered
 from tests.ros.ros_messages import encoded, odometry, scan, transform
 
 RANGES = [5.0] * 180
 
 
-def test_a_recording_is_a_bag(tmp_path):
-    network = MemoryNetwork([offered("/scan", SCAN), offered("/odom", ODOMETRY), offered("/tf_static", TRANSFORMS)])
-    topics = await_sensors(network, "", BagOptions(), 0.0, 0.0)
-    stop, said = threading.Event(), []
-    output = tmp_path / "day.mcap"
-    thread = threading.Thread(target=lambda: said.append(record(network, topics, output, stop, said.append)))
-    thread.start()
-    while "/clock" not in network.subscribed:
-        stop.wait(0.01)
-    network.say("/tf_static", TRANSFORMS, transform(0.0, "base_link", "laser"))
-    for stamp in range(1, 9):
-        network.say("/odom", ODOMETRY, odometry(stamp, (stamp, 0.0, 0.0)))
-        network.say("/scan", SCAN, scan(stamp, RANGES))
-    stop.set()
-    thread.join(120.0)
-    assert said == [{"/tf_static": 1, "/odom": 8, "/scan": 8}]
-    survey = open_source(output).survey()
-    assert (survey.scan_count, survey.path_length_m) == (8, 7.0)
-    assert [path.name for path in tmp_path.iterdir()] == ["day.mcap"]
+TOPICS = [offered("/scan", SCAN), offered("/odom", ODOMETRY), offered("/tf_static", TRANSFORMS)]
 
 
-def recorded(network, output, messages):
-    """Record these messages; returns what is said, and the error if there is one."""
+def messages_of(scans, ranges, **laser):
+    """A mounting, and then odometry and a scan each second."""
+    yield "/tf_static", TRANSFORMS, transform(0.0, "base_link", "laser")
+    for stamp in range(1, scans + 1):
+        yield "/odom", ODOMETRY, odometry(stamp, (stamp, 0.0, 0.0))
+        yield "/scan", SCAN, scan(stamp, ranges, **laser)
+
+
+def recorded(output, messages):
+    """Record these messages; returns what is said, and the counts of each topic or the error."""
+    network = MemoryNetwork(TOPICS)
     topics = await_sensors(network, "", BagOptions(), 0.0, 0.0)
     stop, said = threading.Event(), []
 
     def write():
         try:
-            record(network, topics, output, stop, said.append)
+            said.append(record(network, topics, output, stop, said.append))
         except InputError as error:
             said.append(str(error))
 
@@ -64,26 +54,19 @@ def recorded(network, output, messages):
     return said
 
 
-@contextmanager
-def largest_file(size_bytes):
-    """Writing fails beyond this size, as on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+def test_a_recording_is_a_bag(tmp_path):
+    output = tmp_path / "day.mcap"
+    assert recorded(output, messages_of(8, RANGES)) == [{"/tf_static": 1, "/odom": 8, "/scan": 8}]
+    survey = open_source(output).survey()
+    assert (survey.scan_count, survey.path_length_m) == (8, 7.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["day.mcap"]
 
 
 def test_a_full_disk_keeps_what_was_recorded_before(tmp_path):
-    network = MemoryNetwork([offered("/scan", SCAN), offered("/odom", ODOMETRY), offered("/tf_static", TRANSFORMS)])
-    messages = [("/tf_static", TRANSFORMS, transform(0.0, "base_link", "laser"))]
-    for stamp in range(1, 400):
-        messages.append(("/odom", ODOMETRY, odometry(stamp, (stamp, 0.0, 0.0))))
-        messages.append(("/scan", SCAN, scan(stamp, [5.0] * 3000, increment=0.001)))
+    messages = list(messages_of(399, [5.0] * 3000, increment=0.001))
     part = tmp_path / "day.part.mcap"
     with largest_file(3_500_000):
-        (error,) = recorded(network, tmp_path / "day.mcap", messages)
+        (error,) = recorded(tmp_path / "day.mcap", messages)
     assert f"what was recorded before is in {part}; free some space" in error
     assert list(tmp_path.iterdir()) == [part]
     assert 200 < open_source(part).survey().scan_count < 399

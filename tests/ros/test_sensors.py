@@ -5,7 +5,6 @@ import itertools
 import numpy as np
 import pytest
 
-from fcslam.errors import InputError
 from fcslam.records import CameraImage, GnssFix
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.ros.live_plan import PATIENCE_S, SCANS_FOR_RIG
@@ -129,14 +128,6 @@ def test_a_robot_without_odometry_is_mapped_after_some_seconds():
     assert robot.sensors.planner.base_frame == "base_link"
 
 
-def test_odometry_may_be_left_out():
-    robot = Robot(odom_topic="none").hears("/tf_static", transform(0.0, "base_link", "laser"))
-    for stamp in range(SCANS_FOR_RIG):
-        robot.hears("/scan", scan(float(stamp + 1), RANGES))
-    assert len(robot.records) == SCANS_FOR_RIG
-    assert np.isnan(robot.records[0].T_odom_base).all()
-
-
 def test_a_scan_whose_odometry_does_not_come_gets_the_nearest(robot):
     robot.drives(np.arange(1.0, 7.0))
     robot.hears("/scan", scan(6.5, RANGES))
@@ -148,16 +139,6 @@ def test_a_scan_whose_odometry_does_not_come_gets_the_nearest(robot):
     assert robot.records[-1].T_odom_base[0] == pytest.approx(6.0)
     assert len(robot.said) == 1
     assert "no odometry within 1 s" in robot.said[0]
-
-
-def test_odometry_from_tf():
-    robot = Robot(odometry=None).hears("/tf_static", transform(0.0, "robot/base", "laser"))
-    for stamp in np.arange(1.0, 8.0):
-        robot.hears("/tf", transform(stamp, "map", "robot/odom", (9.0, 9.0, 0.0)))
-        robot.hears("/tf", transform(stamp, "robot/odom", "robot/base", (stamp, 0.0, 0.0)))
-        robot.hears("/scan", scan(stamp, RANGES))
-    assert robot.records[-1].T_odom_base == pytest.approx([7.0, 0.0, 0.0])
-    assert robot.sensors.planner.odom_frame == "robot/odom"
 
 
 def test_the_odometry_in_tf_is_that_of_the_laser():
@@ -212,11 +193,6 @@ def test_a_missing_mounting_says_who_could_publish_it_and_the_robot_waits():
     robot.drives(np.arange(9.0, 300.0)).hears("/tf_static", transform(0.0, "base_link", "laser"))
     assert robot.stamps == list(np.arange(1.0, 300.0))
     assert robot.said == [line]
-
-
-def test_a_mounting_on_the_command_line_needs_no_tf():
-    robot = Robot(laser_poses=((0.1, 0.0, 0.0),)).drives(np.arange(1.0, 1.0 + SCANS_FOR_RIG))
-    assert len(robot.records) == SCANS_FOR_RIG
 
 
 def test_a_camera_whose_clock_is_ahead_delays_no_scan():
@@ -317,68 +293,19 @@ def test_a_laser_that_starts_again_is_merged_again():
     assert sum(record.laser.T_base_laser[0] == pytest.approx(-0.3) for record in again) > 30
 
 
-def test_two_lasers_of_one_frame_are_refused():
-    robot = two_lasers()
-    for stamp in np.arange(1.0, 9.0):
-        robot.hears("/scan", scan(stamp, RANGES)).hears("/rear", scan(stamp, RANGES))
-    with pytest.raises(InputError, match="the scans of /scan and /rear have one frame"):
-        robot.hears("/odom", odometry(1.0, (0.0, 0.0, 0.0)))
-
-
-def test_a_tilted_laser_is_refused():
-    robot = Robot()
-    lying = transform(0.0, "base_link", "laser")
-    lying.transforms[0].transform.rotation = type(lying.transforms[0].transform.rotation)(x=0.7071, y=0, z=0, w=0.7071)
-    robot.hears("/tf_static", lying)
-    with pytest.raises(InputError, match="tilted by 90 degrees"):
-        robot.drives(np.arange(1.0, 9.0))
-
-
-def test_tf_is_not_decoded_once_the_mounting_is_known(robot):
-    robot.drives(np.arange(1.0, 7.0))
-    robot.hears("/tf", b"no message")
-    assert robot.said == []
-
-
-def with_camera():
-    """A robot with a camera of raw images that waits for its mountings."""
-    return Robot(kinds={**KINDS, "/image": IMAGE, "/camera_info": CAMERA_INFO}, camera="/image", info="/camera_info")
-
-
-def mounted(robot):
+def test_raw_images_become_records_at_a_rate_that_is_enough():
+    kinds = {**KINDS, "/image": IMAGE, "/camera_info": CAMERA_INFO}
+    robot = Robot(kinds=kinds, camera="/image", info="/camera_info")
     robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
     robot.hears("/tf_static", transform(0.0, "base_link", "camera", (0.1, 0.0, 0.0)))
-    return robot.hears("/camera_info", camera_info(0.0)).drives(np.arange(1.0, 7.0))
-
-
-@pytest.fixture
-def camera_robot():
-    """The robot with its mountings."""
-    return mounted(with_camera())
-
-
-def images_of(robot):
-    return [record for record in robot.records if isinstance(record, CameraImage)]
-
-
-def test_raw_images_become_records_at_a_rate_that_is_enough(camera_robot):
+    robot.hears("/camera_info", camera_info(0.0)).drives(np.arange(1.0, 7.0))
     for step in range(10):
-        camera_robot.now_s = 0.1 * step
-        camera_robot.hears("/image", image(6.0))
-    images = images_of(camera_robot)
+        robot.now_s = 0.1 * step
+        robot.hears("/image", image(6.0))
+    images = [record for record in robot.records if isinstance(record, CameraImage)]
     assert len(images) == 3
     assert images[0].T_odom_base == pytest.approx([6.0, 0.0, 0.0])
     assert images[0].camera.T_base_camera.translation_m == pytest.approx((0.1, 0.0, 0.0))
-
-
-def test_a_range_max_that_grows_cuts_no_range(robot):
-    robot.drives(np.arange(1.0, 9.0))
-    robot.hears("/scan", scan(9.0, np.full(180, 25.0), range_max=30.0))
-    robot.hears("/odom", odometry(9.5, (9.5, 0.0, 0.0)))
-    record = robot.records[-1]
-    assert robot.records[0].laser.max_range_m == 20.0
-    assert (record.ranges_m == 25.0).all()
-    assert record.laser.max_range_m > 25.0
 
 
 @pytest.mark.parametrize(("columns", "directions"), [(480, 720), (180, 360)])

@@ -1,6 +1,7 @@
 """CARMEN lines made by hand, so that the reader is not tested against the project's own writer."""
 
 import math
+import tracemalloc
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -42,6 +43,17 @@ def drive(scans, start_stamp=100.0, beams=BEAMS):
 def save(path: Path, lines: Iterable[str]) -> Path:
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def peak_of(source: Source) -> int:
+    """Bytes of memory that a pass over a recording takes at most."""
+    source.survey()
+    tracemalloc.start()
+    for _ in source.records():
+        pass
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak
 
 
 def scans_of(source: Source) -> list[LaserScan]:

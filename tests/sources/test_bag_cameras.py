@@ -208,11 +208,7 @@ def test_the_truth_is_never_taken_for_odometry(tmp_path):
 
     scans = [r for r in open_source(rewritten(tmp_path, as_truth)).records() if isinstance(r, LaserScan)]
     assert [record.T_odom_base[0] for record in scans] == [0.125 * k for k in range(5)]
-    alone = rewritten_again(tmp_path, lambda *said: None if said[0] == "/tf" else as_truth(*said))
+    (tmp_path / "again").mkdir()
+    alone = rewritten(tmp_path / "again", lambda *said: None if said[0] == "/tf" else as_truth(*said))
     assert all(np.isnan(each.T_odom_base).all() for each in open_source(alone).records() if isinstance(each, LaserScan))
     assert open_source(alone, BagOptions(odom_topic="/ground_truth")).survey().scan_count == 5
-
-
-def rewritten_again(tmp_path, change):
-    (tmp_path / "again").mkdir()
-    return rewritten(tmp_path / "again", change)

@@ -105,25 +105,6 @@ def test_odometry_that_comes_late_is_waited_for():
         assert_on_the_line(pose, 0.1 * k)
 
 
-def test_scans_come_out_in_the_order_of_the_recording():
-    items = [reading(0.0), scan(0.9), scan(0.1), scan(0.5), reading(1.0), scan(0.8)]
-    assert [entry.scan.stamp for entry in run(items)] == [0.9, 0.1, 0.5, 0.8]
-    for entry in run(items):
-        assert_on_the_line(entry.T_odom_base, entry.scan.stamp)
-
-
-def test_before_the_first_and_after_the_last_reading():
-    items = [scan(0.0), scan(1.5), reading(2.0), reading(3.0), scan(3.7), scan(4.5)]
-    assert [entry.fault for entry in run(items)] == [
-        Fault.NO_ODOMETRY, Fault.HELD_ODOMETRY, Fault.HELD_ODOMETRY, Fault.NO_ODOMETRY,
-    ]  # fmt: skip
-    assert poses(items)[1:3] == [reading(2.0).T_odom_base, reading(3.0).T_odom_base]
-
-
-def test_without_any_odometry_no_scan_has_some():
-    assert [entry.fault for entry in run([scan(1.0), scan(2.0)])] == [Fault.NO_ODOMETRY] * 2
-
-
 def test_equal_stamps_take_the_reading_beside_them():
     items = [reading(1.0, (1, 0, 0)), scan(1.0), reading(1.0, (2, 0, 0)), scan(1.0), reading(1.0, (3, 0, 0))]
     assert poses(items) == [(1, 0, 0), (2, 0, 0)]

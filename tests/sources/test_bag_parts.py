@@ -81,11 +81,6 @@ def test_each_topic_in_a_file_of_its_own(tmp_path):
     assert_same(scans_of(source), whole)
 
 
-def test_recordings_of_one_time_are_no_parts(tmp_path):
-    files = [save(tmp_path / f"run_{k}.bag", drive(60, start=100.0 + 3.0 * k)) for k in range(2)]
-    assert "has scans in /scan of the same time as" in refusal_of_parts(files)
-
-
 def test_recordings_of_several_days_are_no_parts(tmp_path):
     files = [save(tmp_path / f"run_{k}.bag", drive(60, start=100.0 + 90_000.0 * k)) for k in range(2)]
     assert "run_1.bag: begins 89988 s after" in refusal_of_parts(files)

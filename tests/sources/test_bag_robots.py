@@ -8,11 +8,11 @@ import pytest
 
 import fcslam
 from fcslam.errors import SourceError
-from fcslam.records import LaserScan
 from fcslam.sources import BagOptions, check_copies, open_fleet, open_source
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.inspection import inspect
 from tests.sources.bag_messages import BEAMS, drive, odom, pose_at, quaternion, save, scan, tf
+from tests.sources.carmen_text import scans_of
 from tests.sources.test_bag_faults import refusal
 
 pytestmark = pytest.mark.slow
@@ -43,21 +43,13 @@ def robot(number, space="", prefix="", start=100.0, scans=20, with_odom=True, wi
     return said
 
 
+PREFIXED = {"with_tf": True, "shared": ("tf", "tf_static")}
 FLEETS = {
     "namespaces": [{"space": f"/robot{k}"} for k in (1, 2)],
     "tf alone in namespaces": [{"space": f"/robot{k}", "with_odom": False, "with_tf": True} for k in (1, 2)],
-    "prefixes in one tf": [
-        {"space": f"/robot{k}", "prefix": f"robot{k}/", "with_tf": True, "shared": ("tf", "tf_static")} for k in (1, 2)
-    ],
+    "prefixes in one tf": [{**PREFIXED, "space": f"/robot{k}", "prefix": f"robot{k}/"} for k in (1, 2)],
     "prefixes in one tf without topics of odometry": [
-        {
-            "space": f"/robot{k}",
-            "prefix": f"robot{k}/",
-            "with_odom": False,
-            "with_tf": True,
-            "shared": ("tf", "tf_static"),
-        }
-        for k in (1, 2)
+        {**PREFIXED, "space": f"/robot{k}", "prefix": f"robot{k}/", "with_odom": False} for k in (1, 2)
     ],
     "all on the same topics": [{"prefix": f"robot{k}/", "with_tf": True} for k in (1, 2)],
     "namespaces in a namespace": [{"space": f"/fleet/robot{k}", "with_tf": True} for k in (1, 2)],
@@ -67,16 +59,12 @@ FLEETS = {
 
 def same(found, expected):
     """Whether two sources give the same scans, to the last bit."""
-    pairs = zip(
-        *([each for each in source.records() if isinstance(each, LaserScan)] for source in (found, expected)),
-        strict=True,
-    )
     return all(
         a.stamp == b.stamp
         and a.laser == b.laser
         and np.array_equal(a.ranges_m, b.ranges_m)
         and np.array_equal(a.T_odom_base, b.T_odom_base)
-        for a, b in pairs
+        for a, b in zip(scans_of(found), scans_of(expected), strict=True)
     )
 
 
@@ -106,8 +94,7 @@ def test_a_bag_of_two_robots_is_decoded_once(tmp_path, suffix):
     for found in robots:
         later = found.corrected(BagCorrection(odometry_delay_s=0.02), ("late",))
         for source in (found, copy.copy(found), later):
-            scans = [each for each in source.records() if isinstance(each, LaserScan)]
-            assert len(scans) == source.survey().scan_count == 20
+            assert len(scans_of(source)) == source.survey().scan_count == 20
 
 
 def fleet_bag(folder, kind="namespaces", name="fleet.mcap"):
@@ -182,7 +169,7 @@ def two_frames(rear_in_tf=True):
 
 def test_the_frames_on_one_topic_are_lasers_of_one_robot(tmp_path):
     source = open_source(save(tmp_path / "run.mcap", two_frames()))
-    scans = [each for each in source.records() if isinstance(each, LaserScan)]
+    scans = scans_of(source)
     assert len(scans) == 40
     assert {each.laser.T_base_laser for each in scans[::2]} == {(0.2, 0.0, 0.0)}
     assert {each.laser.T_base_laser[:2] for each in scans[1::2]} == {(-0.2, 0.0)}
@@ -233,7 +220,7 @@ def above(*links, odometry="odom"):
 def test_the_odometry_is_what_moves_above_the_laser(tmp_path, links, odometry):
     source = open_source(save(tmp_path / "run.mcap", above(*links, odometry=odometry)))
     assert source.plan.odometry.edge == (odometry, "base_link")
-    poses = np.array([each.T_odom_base for each in source.records() if isinstance(each, LaserScan)])
+    poses = np.array([each.T_odom_base for each in scans_of(source)])
     expected = np.array([pose_at(0.2 * step + 0.05) for step in range(len(poses))])
     assert np.abs(poses[:, :2] - expected[:, :2]).max() < 0.002
 

@@ -13,7 +13,7 @@ from fcslam.errors import InputError, SourceError
 from fcslam.records import LaserModel, LaserScan, Odometry, Sweep, frozen
 from fcslam.sources import open_source, write_bag
 from tests.sources.bag_messages import ROS1, ROS2, drive, save
-from tests.sources.carmen_text import pose_at
+from tests.sources.carmen_text import only_scans, pose_at, scans_of
 
 pytestmark = pytest.mark.slow
 
@@ -53,12 +53,12 @@ def test_what_is_written_reads_back_to_the_last_bit(tmp_path_factory, records, n
     path = tmp_path_factory.mktemp("bag") / name
     write_bag(path, records)
     source = open_source(path)
-    written = [record for record in records if isinstance(record, LaserScan)]
+    written = only_scans(records)
     if 2 * sum(after.stamp < before.stamp for before, after in pairwise(written)) > len(written):
         with pytest.raises(SourceError, match="time runs backwards"):
             source.survey()
         return
-    read = [record for record in source.records() if isinstance(record, LaserScan)]
+    read = scans_of(source)
     assert len(read) == len(written)
     for before, after in zip(written, read, strict=True):
         assert after.stamp == before.stamp
@@ -88,8 +88,8 @@ def turning(sweep, count=40):
 def test_the_times_of_the_beams_come_back_and_the_motion_from_the_odometry(tmp_path, name, sweep):
     records = list(turning(sweep))
     write_bag(tmp_path / name, records)
-    scans = [record for record in records if isinstance(record, LaserScan)]
-    read = [record for record in open_source(tmp_path / name).records() if isinstance(record, LaserScan)]
+    scans = only_scans(records)
+    read = scans_of(open_source(tmp_path / name))
     for before, after in zip(scans, read, strict=True):
         assert after.stamp == before.stamp
         np.testing.assert_allclose(after.T_odom_base, before.T_odom_base, atol=1e-9)

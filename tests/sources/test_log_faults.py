@@ -84,8 +84,25 @@ def test_a_truncated_archive_is_refused_wherever_it_ends(tmp_path, compress, kep
     assert "truncated" in refusal(path)
 
 
-def test_a_log_without_laser_scans_is_refused(tmp_path):
-    assert "no laser scan" in refusal(save(tmp_path / "run.log", [odom(k, pose_at(k)) for k in range(30)]))
+def scaled(scale):
+    return [flaser(k, (scale * 0.5 * k, 0.1 * scale * k, 0.01 * k)) for k in range(30)]
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ([odom(k, pose_at(k)) for k in range(30)], "no laser scan"),
+        (scaled(100.0), "as if in millimetres or centimetres"),
+        (scaled(1000.0), "as if in millimetres or centimetres"),
+        (drive(30) + drive(31, 200, 9), "line 62: 31 scans are not of the laser of the first ones"),
+        (3 * drive(300), "line 602"),
+        (drive(50)[::-1], "backwards"),
+        (drive(12) + ["??!"] * 30, "damaged"),
+    ],
+    ids=["no scan", "centimetres", "millimetres", "another laser", "three in one", "reversed", "damaged"],
+)
+def test_a_log_that_cannot_be_mapped_is_refused_with_the_reason(tmp_path, lines, words):
+    assert words in refusal(save(tmp_path / "run.log", lines))
 
 
 @pytest.mark.parametrize(
@@ -103,42 +120,19 @@ def test_odometry_that_says_nothing_is_not_used(tmp_path, poses, words):
 
 
 @pytest.mark.parametrize(
-    "poses", [[(0.1 * k, 0, 0) for k in range(30)], [(1, 2, 0)] * 9, [(0, 0, 0.1 * k) for k in range(30)]]
+    "poses",
+    [
+        [(0.1 * k, 0, 0) for k in range(30)],
+        [(1, 2, 0)] * 9,
+        [(0, 0, 0.1 * k) for k in range(30)],
+        [(0.5 * k + 1e6 * (k > 15), 0.1 * k, 0.01 * k) for k in range(30)],
+    ],
+    ids=["straight", "few scans", "a turn", "one long jump"],
 )
-def test_odometry_of_a_straight_drive_a_turn_or_a_few_scans_is_used(tmp_path, poses):
+def test_odometry_that_is_odd_but_right_is_used(tmp_path, poses):
     source = open_source(save(tmp_path / "run.log", [flaser(k, pose) for k, pose in enumerate(poses)]))
-    assert source.survey().notes == ()
+    assert not any("no odometry" in note for note in source.survey().notes)
     assert all(np.isfinite(record.T_odom_base).all() for record in source.records())
-
-
-@pytest.mark.parametrize("scale", [100.0, 1000.0])
-def test_odometry_in_centimetres_or_millimetres_is_refused(tmp_path, scale):
-    lines = [flaser(k, (scale * 0.5 * k, 0.1 * scale * k, 0.01 * k)) for k in range(30)]
-    assert "as if in millimetres or centimetres" in refusal(save(tmp_path / "run.log", lines))
-
-
-def test_one_long_jump_of_the_odometry_is_not_another_unit(tmp_path):
-    lines = [flaser(k, (0.5 * k + 1e6 * (k > 15), 0.1 * k, 0.01 * k)) for k in range(30)]
-    assert open_source(save(tmp_path / "run.log", lines)).survey().scan_count == 30
-
-
-def test_a_change_of_the_laser_is_refused_with_its_line(tmp_path):
-    message = refusal(save(tmp_path / "run.log", drive(30) + drive(31, start_stamp=200, beams=9)))
-    assert "line 62: 31 scans are not of the laser of the first ones" in message
-
-
-def test_three_recordings_put_together_are_refused_with_the_line(tmp_path):
-    message = refusal(save(tmp_path / "run.log", 3 * drive(300)))
-    assert "line 602" in message
-    assert "59.8 s" in message
-
-
-def test_a_reversed_log_is_refused(tmp_path):
-    assert "backwards" in refusal(save(tmp_path / "run.log", drive(50)[::-1]))
-
-
-def test_a_log_of_mostly_damaged_lines_is_refused(tmp_path):
-    assert "damaged" in refusal(save(tmp_path / "run.log", drive(12) + ["??!"] * 30))
 
 
 DAMAGED_SCANS = {
@@ -182,28 +176,20 @@ def test_a_few_misfits_are_skipped_and_counted(tmp_path):
     assert source.survey().faults.counts == source.faults.counts
 
 
-def test_small_steps_back_in_time_are_kept_in_file_order(tmp_path):
-    stamps = [0.0, 1.0, 0.5, 2.0, 2.0, 1.1, 3.0]
+@pytest.mark.parametrize(
+    ("stamps", "duration_s", "reversals", "repeated"),
+    [
+        ([0.0, 1.0, 0.5, 2.0, 2.0, 1.1, 3.0], 3.0, FaultCount(2, 3, pytest.approx(0.9)), FaultCount(1, 5)),
+        ([*range(50), 9000, *range(51, 100)], 9000.0, FaultCount(1, 52, 9000 - 51), FaultCount()),
+        ([0.0] * 30, 0.0, FaultCount(), FaultCount(29, 2)),
+    ],
+    ids=["small steps back", "one far ahead", "no clock"],
+)
+def test_scans_of_an_odd_clock_are_kept_in_file_order(tmp_path, stamps, duration_s, reversals, repeated):
     source = open_source(save(tmp_path / "run.log", [flaser(t, pose_at(k)) for k, t in enumerate(stamps)]))
     assert [scan.stamp for scan in scans_of(source)] == stamps
-    assert source.survey().duration_s == 3.0
-    assert source.faults[Fault.TIME_REVERSAL].count == 2
-    assert source.faults[Fault.TIME_REVERSAL].largest_s == pytest.approx(0.9)
-    assert source.faults[Fault.REPEATED_STAMP] == FaultCount(1, 5)
-
-
-def test_one_stamp_far_ahead_does_not_cost_the_scans_behind_it(tmp_path):
-    stamps = [*range(50), 9000, *range(51, 100)]
-    source = open_source(save(tmp_path / "run.log", [flaser(t, pose_at(k)) for k, t in enumerate(stamps)]))
-    assert [scan.stamp for scan in scans_of(source)] == stamps
-    assert source.faults[Fault.TIME_REVERSAL] == FaultCount(1, 52, 9000 - 51)
-
-
-def test_a_log_without_a_clock_is_read(tmp_path):
-    source = open_source(save(tmp_path / "run.log", [flaser(0, pose_at(k)) for k in range(30)]))
-    assert len(scans_of(source)) == 30
-    assert source.survey().duration_s == 0.0
-    assert source.faults[Fault.REPEATED_STAMP].count == 29
+    assert source.survey().duration_s == duration_s
+    assert (source.faults[Fault.TIME_REVERSAL], source.faults[Fault.REPEATED_STAMP]) == (reversals, repeated)
 
 
 def test_bad_ranges_become_nan_and_are_counted(tmp_path):
@@ -275,16 +261,6 @@ def test_a_count_of_ranges_that_cannot_be_is_a_broken_line(tmp_path, count):
 )
 def test_random_words_never_break_the_reader(tmp_path, lines):
     survives(save(tmp_path / "run.log", ["ODOM 0 0 0 0 0 0 0 h 0", *lines]))
-
-
-@pytest.mark.slow
-@fuzz
-@given(st.data())
-def test_a_spliced_log_never_breaks_the_reader(tmp_path, data):
-    log = "\n".join(drive(6)).encode()
-    start = data.draw(st.integers(0, len(log)))
-    end = data.draw(st.integers(start, len(log)))
-    survives(written(tmp_path / "run.log", log[:start] + data.draw(st.binary(max_size=20)) + log[end:]))
 
 
 @pytest.mark.slow

@@ -44,33 +44,25 @@ def refusal(path):
     return str(caught.value)
 
 
+@pytest.mark.parametrize(("measuring", "percent"), [(0, "0.0"), (1, "0.8")])
 @pytest.mark.parametrize("value", [0.0, math.inf, math.nan, 12.0, 65.535, 0.05, -1.0])
-def test_a_covered_laser_is_refused(tmp_path, value):
-    message = refusal(bag(tmp_path / "run.bag", lambda _, values: np.full(len(values), value)))
-    assert "only 0.0% of the beams of /scan measure a range (0.1 m to 12 m) in" in message
-
-
-def test_a_laser_that_is_nearly_covered_is_refused(tmp_path):
-    def covered(_, values):
-        return np.where(np.arange(len(values)) == 7, values, math.inf)
-
-    assert "only 0.8% of the beams" in refusal(bag(tmp_path / "run.bag", covered))
+def test_a_covered_laser_is_refused(tmp_path, value, measuring, percent):
+    message = refusal(
+        bag(tmp_path / "run.bag", lambda _, values: np.append(values[:measuring], [value] * (BEAMS - measuring)))
+    )
+    assert f"only {percent}% of the beams of /scan measure a range (0.1 m to 12 m) in" in message
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1000.0, "millimetres"), (100.0, "centimetres")])
-@pytest.mark.parametrize("scaled_limits", [True, False])
-def test_other_units_are_refused(tmp_path, factor, unit, scaled_limits):
-    limits = {"range_max": 12.0 * factor, "range_min": 0.1 * factor} if scaled_limits else {}
-    message = refusal(bag(tmp_path / "run.mcap", lambda _, values: values * factor, **limits))
+@pytest.mark.parametrize("recorded", ["scaled limits", "limits in metres", "log"])
+def test_other_units_are_refused(tmp_path, factor, unit, recorded):
+    limits = {"range_max": 12.0 * factor, "range_min": 0.1 * factor} if recorded == "scaled limits" else {}
+    if recorded == "log":
+        lines = [flaser(k, pose(k), ranges=tuple(np.round(ranges(k) * factor))) for k in range(40)]
+        message = refusal(save_log(tmp_path / "run.log", lines))
+    else:
+        message = refusal(bag(tmp_path / "run.mcap", lambda _, values: values * factor, **limits))
     assert f"they seem to be {unit}: divide them by {factor:g}" in message
-
-
-@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "millimetres"), (100.0, "centimetres")])
-def test_other_units_in_a_log_are_refused(tmp_path, factor, unit):
-    lines = [flaser(k, pose(k), ranges=tuple(np.round(ranges(k) * factor))) for k in range(40)]
-    assert f"they seem to be {unit}" in refusal(save_log(tmp_path / "run.log", lines))
-    nothing = [flaser(k, pose(k), ranges=(81.91,) * BEAMS) for k in range(40)]
-    assert "only 0.0% of the beams measure a range (0 m to 50 m)" in refusal(save_log(tmp_path / "no.log", nothing))
 
 
 @pytest.mark.parametrize(("unit", "bits"), [(100.0, 8), (1000.0, 12)])
@@ -81,22 +73,6 @@ def test_a_counter_that_overflows_is_refused(tmp_path, unit, bits):
     message = refusal(bag(tmp_path / "run.bag", counted))
     assert float(message.split("go from ")[1].split()[0]) == pytest.approx(2**bits / unit, rel=0.01)
     assert "as a counter that overflows" in message
-
-
-def test_near_things_before_far_ones_are_no_overflow(tmp_path):
-    """Posts near the laser, and no return or codes for it beside them."""
-
-    def seen(step, values):
-        at = np.arange(BEAMS) + step
-        near = np.where(at % 9 == 0, 0.11 + 0.001 * (at % 40), values)
-        return np.where(at % 9 == 1, 11.9, near)
-
-    assert open_source(bag(tmp_path / "run.bag", seen)).survey().scan_count == 40
-
-
-def test_a_range_max_below_most_ranges_is_refused(tmp_path):
-    message = refusal(bag(tmp_path / "run.bag", range_max=1.0))
-    assert "beyond the range_max of 1 m" in message
 
 
 @pytest.mark.parametrize("strength", [9.0, 60.0, 900.0])
@@ -130,31 +106,34 @@ def test_a_placeholder_in_a_log_is_no_range(tmp_path):
     assert np.isnan(scans_of(source)[0].ranges_m).sum() == (missing(0, ranges(0), 10.0) == 10.0).sum()
 
 
-def assert_whole(path):
-    source = open_source(path)
-    assert not source.survey().notes
-    assert not any(np.isnan(one.ranges_m).any() for one in scans_of(source))
+def posts(step, values):
+    """Posts near the laser, and no return or codes for it beside them."""
+    at = np.arange(BEAMS) + step
+    near = np.where(at % 9 == 0, 0.11 + 0.001 * (at % 40), values)
+    return np.where(at % 9 == 1, 11.9, near)
 
 
-@pytest.mark.parametrize("quantum", [0.001, 0.01, 0.05, 0.1])
-def test_coarse_ranges_are_ranges(tmp_path, quantum):
-    assert_whole(bag(tmp_path / "run.bag", lambda step, _: ranges(step, quantum)))
-
-
-def test_a_robot_that_stands_still_sees_the_same(tmp_path):
-    assert_whole(bag(tmp_path / "run.bag", lambda *_: ranges(0, 0.01), pose=lambda _: pose(0)))
-
-
-def test_a_robot_along_a_wall_sees_it_at_the_same_distance(tmp_path):
+def along_a_wall(*_):
     """A corridor of 1.6 m: from its middle all scans are the same, to 5 cm."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, BEAMS)
     with np.errstate(divide="ignore"):
-        corridor = np.minimum(np.round(0.8 / np.abs(np.sin(angles)) / 0.05) * 0.05, 9.0 + 0.02 * np.arange(BEAMS))
-    assert_whole(bag(tmp_path / "run.bag", lambda *_: corridor, pose=lambda step: (0.4 * step, 0.0, 0.0)))
+        return np.minimum(np.round(0.8 / np.abs(np.sin(angles)) / 0.05) * 0.05, 9.0 + 0.02 * np.arange(BEAMS))
 
 
-def test_a_hall_that_is_wider_than_the_laser_sees_is_no_fault(tmp_path):
-    """Nine of ten beams have no return."""
-    assert open_source(
-        bag(tmp_path / "run.bag", lambda step, values: missing(step, values, math.inf, 0.9))
-    ).survey().scan_count == 40  # fmt: skip
+HONEST = {
+    "steps of 1 mm": (lambda step, _: ranges(step, 0.001), pose),
+    "steps of 10 cm": (lambda step, _: ranges(step, 0.1), pose),
+    "a robot at rest": (lambda *_: ranges(0, 0.01), lambda _: pose(0)),
+    "along a wall": (along_a_wall, lambda step: (0.4 * step, 0.0, 0.0)),
+    "a hall wider than the laser sees": (lambda step, values: missing(step, values, math.inf, 0.9), pose),
+    "near things before far ones": (posts, pose),
+}
+
+
+@pytest.mark.parametrize(("change", "pose"), HONEST.values(), ids=HONEST)
+def test_honest_scans_pass_as_they_are(tmp_path, change, pose):
+    source = open_source(bag(tmp_path / "run.bag", change, pose))
+    assert source.survey().scan_count == 40
+    if change is not posts:  # their codes may be taken for placeholders
+        assert not source.survey().notes
+        assert not any(np.isnan(one.ranges_m).any() for one in scans_of(source))

@@ -13,8 +13,7 @@ from fcslam.lab.simulation.floorplan import (
     move_furniture,
 )
 from fcslam.lab.simulation.options import Building, Lighting
-from fcslam.lab.simulation.route import schedule
-from tests.lab.simulation.driving import distances, drive, route
+from tests.lab.simulation.driving import distances
 
 every_building = pytest.mark.parametrize("building", list(Building))
 
@@ -78,21 +77,6 @@ def test_moving_leaves_walls_and_keeps_furniture_in_its_room(building):
             (room,) = (r for r in plan.rooms if np.all(before.centre > r.low) and np.all(before.centre < r.high))
             assert np.all((after.outline > room.low) & (after.outline < room.high))
     assert changed >= len(plan.rooms)
-
-
-def test_nothing_moves_where_nothing_shall():
-    plan = draw_floor_plan(np.random.default_rng(4))
-    moved = move_furniture(plan, 0.0, np.random.default_rng(5))
-    np.testing.assert_array_equal(moved.segments, plan.segments)
-
-
-def test_a_schedule_is_the_drive_at_any_time():
-    rng = np.random.default_rng(6)
-    waypoints = route(draw_floor_plan(rng), 20.0, rng)
-    stamps, poses = drive(waypoints, 0.1)
-    planned = schedule(waypoints)
-    np.testing.assert_array_equal(planned.at(stamps), poses)
-    np.testing.assert_allclose(planned.at(np.array([planned.duration_s]))[0, :2], waypoints[-1])
 
 
 def test_lamps_fail_and_evening_is_darker():

@@ -1,25 +1,14 @@
 """A fleet on disk: two simulations give the same bytes; a folder in use and a full disk are one line each."""
 
-import resource
 from pathlib import Path
 
 import pytest
 
 from fcslam.cli import main
+from tests.full_disk import largest_file
 
-COMMAND = [
-    "tools",
-    "simulate",
-    "--building",
-    "flat",
-    "--path-length",
-    "4",
-    "--robots",
-    "2",
-    "--no-camera",
-    "--seed",
-    "2",
-]
+FLEET = ["--building", "flat", "--path-length", "4", "--robots", "2", "--no-camera", "--seed", "2"]
+COMMAND = ["tools", "simulate", *FLEET]
 
 
 def files(folder):
@@ -44,14 +33,8 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, capsys):
 
 
 def test_a_full_disk_is_one_line_and_leaves_no_half_recording(tmp_path, capsys):
-    """A limit on file sizes stands for the disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
-    try:
-        code = main([*COMMAND, "--output", str(tmp_path / "full")])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert code == 2
+    with largest_file(50_000):
+        assert main([*COMMAND, "--output", str(tmp_path / "full")]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "cannot be written (File too large)" in line
     assert files(tmp_path / "full").keys() == {Path("simulation.yaml")}

@@ -103,20 +103,6 @@ def test_short_and_long_routes(length_m):
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_route_and_another_another():
-    np.testing.assert_array_equal(route_of(5), route_of(5))
-    assert not np.array_equal(route_of(5), route_of(6))
-
-
-@pytest.mark.slow
-def test_a_further_robot_changes_no_goals():
-    plan = draw_floor_plan(np.random.default_rng(1))
-    few, more = (draw_goals(plan, robots, 40.0, np.random.default_rng(1)) for robots in (2, 5))
-    for a, b in zip(few, more[:2], strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("building", list(Building))
 def test_neighbours_share_ground_and_return_to_their_own(building):
     rng = np.random.default_rng(0)

@@ -127,20 +127,6 @@ def test_scales_are_wrong_by_eight_percent_in_the_mean():
     assert np.mean(np.abs(np.array(ends) / 20.0 - 1.0)) == pytest.approx(0.08, abs=0.01)
 
 
-def test_every_kind_of_odometry_has_its_settings():
-    assert set(KINDS) == set(OdometryKind)
-    assert {kind for kind, settings in KINDS.items() if settings is None} == {OdometryKind.NONE}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_default_odometry_is_bad_enough_to_need_a_map(seed):
-    truth = true_drive(seed)
-    odometry = simulate_odometry(truth, KINDS[OdometryKind.DEFAULT], np.random.default_rng(seed))
-    end = se2.between(se2.between(truth[0], truth[-1]), odometry[-1])
-    assert 0.1 < np.hypot(end[0], end[1]) < 10.0
-
-
 @pytest.mark.parametrize(
     "content", [{"robots": 0}, {"path_length_m": -1}, {"lidar": {"dropout": 2}}, {"lidar": {"beam": 3}}]
 )

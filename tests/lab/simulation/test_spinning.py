@@ -92,25 +92,6 @@ def test_beams_placed_by_the_true_motion_lie_on_the_walls(scanner):
     assert np.quantile(ignored, 0.99) > 0.1
 
 
-@pytest.mark.parametrize("scanner", SPINNING)
-def test_noise_and_dropouts_are_those_of_the_scanner(scanner):
-    lidar = SCANNERS[scanner]
-    noisy, exact = robot(scanner, path_length_m=2.0), robot(scanner, path_length_m=2.0, **EXACT)
-    pairs = list(zip(noisy.scans(), exact.scans(), strict=True))
-    measured, true = (np.concatenate([scan.ranges_m for scan in scans]) for scans in zip(*pairs, strict=True))
-    hit = true < lidar.max_range_m
-    assert np.mean(measured[hit] == lidar.max_range_m) == pytest.approx(lidar.dropout, rel=0.2)
-    returned = hit & (measured < lidar.max_range_m)
-    assert np.std((measured - true)[returned]) == pytest.approx(lidar.range_noise_m, rel=0.1)
-
-
-def test_the_low_cost_scanners_turn_clockwise():
-    clockwise = {scanner: SCANNERS[scanner].sweep(robot(scanner).lasers[0].beams) for scanner in SPINNING}
-    assert {scanner: sweep.first_s > sweep.last_s for scanner, sweep in clockwise.items()} == {
-        Scanner.RPLIDAR_A1: True, Scanner.LD19: True, Scanner.UTM_30LX: False,
-    }  # fmt: skip
-
-
 def test_speeds_change_steadily():
     instant, spinning = robot(Scanner.INSTANT).route, robot(Scanner.LD19).route
     times = np.arange(0.0, spinning.duration_s, 0.02)
