@@ -38,8 +38,7 @@ from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.records import Constraint, ConstraintKind, Keyscan, KeyscanId, Place, Removal, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.sources import open_source
-from fcslam.sources.split import split
+from fcslam.sources import open_source, split
 from fcslam.wire.checks import check
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.packets import decode, encode

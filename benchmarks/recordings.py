@@ -110,8 +110,6 @@ RANGES = {
     "roots of ranges": lambda k, r: 2.0 * np.sqrt(r),
     "0.3 m too long": lambda k, r: r + 0.3,
     "0.3 m too short": lambda k, r: np.maximum(r - 0.3, 0.0),
-    "centimetres in 8 bits": lambda k, r: np.round(100.0 * r) % 256 / 100.0,
-    "millimetres in 12 bits": lambda k, r: np.round(1000.0 * r) % 4096 / 1000.0,
     "two way distances": lambda k, r: 2.0 * r,
     "whole metres": lambda k, r: np.floor(r),
     "beams in another order": lambda k, r: r[np.random.default_rng(0).permutation(len(r))],

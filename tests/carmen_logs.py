@@ -5,6 +5,7 @@ import gzip
 import lzma
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ def write_carmen(path: Path, records: Iterable[SensorRecord]) -> None:
     usual = len({scan.laser for scan in scans}) == 1
     if usual:
         laser = scans[0].laser
-        usual = (*laser.beams[1:], laser.max_range_m) == assumed_laser(laser.beam_count)
+        usual = replace(laser, T_base_laser=(0.0, 0.0, 0.0)) == assumed_laser(laser.beam_count)
     text = "".join(f"{_line(record, usual)}\n" for record in kept)
     path.write_bytes(COMPRESS.get(path.suffix, bytes)(text.encode()))
 

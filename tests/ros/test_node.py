@@ -13,7 +13,6 @@ from fcslam.geometry import se2
 from fcslam.live.fleet_view import Teammate
 from fcslam.live.records import Wiring
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, parse_map
-from fcslam.ros.network import Endpoint, Quality
 from fcslam.ros.node import EMPTY, FINISH, INITIAL_POSE, SAVE_MAP, STRING, RobotNode, await_sensors
 from fcslam.ros.outputs import POSE
 from fcslam.ros.parameters import NodeParameters
@@ -127,20 +126,6 @@ def test_a_simulated_clock_that_does_not_run_is_told_once_and_the_robot_maps(net
         time.sleep(0.3)
     assert len(said) == 1
     assert "nobody publishes /clock, so map -> odom is published once for each scan; start the simulator" in said[0]
-
-
-def test_peers_that_get_nothing_are_told_once(network, robot):
-    said = []
-    node = start(network, robot, said.append)
-    network.others += [
-        Endpoint("/robot1/pose", "geometry_msgs/PoseWithCovarianceStamped", False, Quality(True, True)),
-        Endpoint("/robot1/map", "nav_msgs/GridCells", False, Quality(True)),
-    ]
-    for _ in range(2):
-        node.watch_network()
-    assert len(said) == 2
-    assert "/robot1/pose: a subscription asks for transient local messages, and the publisher is volatile" in said[0]
-    assert "/robot1/map: another node takes it as nav_msgs/GridCells" in said[1]
 
 
 def test_a_robot_of_the_same_name_that_comes_later_is_told_once(network, robot):

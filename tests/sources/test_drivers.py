@@ -123,8 +123,8 @@ def outcome(path, options=None):
     return said + lost, float(np.sqrt(np.mean(np.sum(np.vstack(off) ** 2, axis=1))))
 
 
-INCHES = "inches: by 39.37"
-WRONG = (INCHES, "may be feet", "the robot's distance is 0.5", "span 3")
+UNIT = "they seem to be in another unit"
+WRONG = (UNIT, "may be feet", "the robot's distance is 0.5", "span 3")
 """Lines about ranges and angles that are not corrected."""
 SLOW, FAST = 0.2 * 359 / 360, 0.1 * 359 / 360
 WIDE = {"beams": 811, "first_rad": math.radians(-135.0), "step_deg": 1.0 / 3.0}
@@ -172,7 +172,7 @@ SCANNERS = {
     "lslidar N10, range_max 0": Scanner(
         first_rad=0.0, turns_s=-FAST, nothing=0.0, range_max=0.0, shortest_m=0.0, line="states no range_max"
     ),
-    "inches": Scanner(unit=39.37, range_max=12.0 * 39.37, line=INCHES),
+    "inches": Scanner(unit=39.37, range_max=12.0 * 39.37, line=UNIT),
     "feet": Scanner(unit=1.0 / 0.3048, range_max=40.0, line="may be feet"),
     "a counter of half the time of flight": Scanner(unit=0.5, line="the robot's distance is 0.5"),
     "a turn stated as 270 deg": Scanner(bent=0.75, line="span 3"),

@@ -10,7 +10,15 @@ from fcslam.records import Beams, LaserModel
 from fcslam.sources.bags.camera import calibration_of
 from fcslam.sources.bags.clouds import cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import IMAGE, LIVOX_CLOUDS, POINT_CLOUD, MessageCodec
-from fcslam.sources.point_clouds import DIRECTIONS, BodySample, CloudBand, CloudMounting, directions_in, floor_in
+from fcslam.sources.point_clouds import (
+    DIRECTIONS,
+    BodySample,
+    CloudBand,
+    CloudMounting,
+    directions_in,
+    floor_in,
+    scan_of_cloud,
+)
 from tests.sources.clouds import (
     DOUBLES,
     HESAI,
@@ -44,7 +52,7 @@ def mounting(R=None, position=(0.0, 0.0, 0.4)):
 
 
 def read(message, where=None, band=BAND, kind=POINT_CLOUD, **options):
-    return cloud_of(message, kind, 0, **options).scan(where or mounting(), band)
+    return scan_of_cloud(cloud_of(message, kind, 0, **options), where or mounting(), band)
 
 
 def errors_m(scan, heading=0.0, x=0.0, y=0.0):
@@ -85,8 +93,8 @@ def test_the_layout_of_a_spinning_scanner(layout, begin_s, height, clockwise):
 def test_the_returns_of_a_sparse_scanner_are_neighbours(columns, directions, clockwise):
     message = cloud(STAMP, spinning(at_rest, columns=columns, clockwise=clockwise, first_rad=0.7), VELODYNE)
     found = cloud_of(message, POINT_CLOUD, 0)
-    assert directions_in([found.cloud], mounting()) == directions
-    scan = found.scan(mounting()._replace(directions=directions), BAND)
+    assert directions_in([found], mounting()) == directions
+    scan = scan_of_cloud(found, mounting()._replace(directions=directions), BAND)
     assert scan.beams.beam_count == directions
     errors, seen = errors_m(scan)
     assert seen > 0.95

@@ -53,26 +53,16 @@ def test_a_covered_laser_is_refused(tmp_path, value, measuring, percent):
     assert f"only {percent}% of the beams of /scan measure a range (0.1 m to 12 m) in" in message
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "millimetres"), (100.0, "centimetres")])
+@pytest.mark.parametrize("factor", [1000.0, 100.0])
 @pytest.mark.parametrize("recorded", ["scaled limits", "limits in metres", "log"])
-def test_other_units_are_refused(tmp_path, factor, unit, recorded):
+def test_other_units_are_refused(tmp_path, factor, recorded):
     limits = {"range_max": 12.0 * factor, "range_min": 0.1 * factor} if recorded == "scaled limits" else {}
     if recorded == "log":
         lines = [flaser(k, pose(k), ranges=tuple(np.round(ranges(k) * factor))) for k in range(40)]
         message = refusal(save_log(tmp_path / "run.log", lines))
     else:
         message = refusal(bag(tmp_path / "run.mcap", lambda _, values: values * factor, **limits))
-    assert f"they seem to be {unit}: divide them by {factor:g}" in message
-
-
-@pytest.mark.parametrize(("unit", "bits"), [(100.0, 8), (1000.0, 12)])
-def test_a_counter_that_overflows_is_refused(tmp_path, unit, bits):
-    def counted(_, values):
-        return np.round(unit * values) % 2**bits / unit
-
-    message = refusal(bag(tmp_path / "run.bag", counted))
-    assert float(message.split("go from ")[1].split()[0]) == pytest.approx(2**bits / unit, rel=0.01)
-    assert "as a counter that overflows" in message
+    assert "they seem to be in another unit" in message
 
 
 @pytest.mark.parametrize("strength", [9.0, 60.0, 900.0])

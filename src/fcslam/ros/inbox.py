@@ -10,6 +10,8 @@ from fcslam.ros.network import Quality, RosNetwork
 from fcslam.ros.topics import TF_STATIC
 from fcslam.sources.bags.transforms import last_part
 
+POLL_S: Final = 0.1
+"""How long whoever reads an inbox waits for a message."""
 LARGEST_INBOX_BYTES: Final = 64_000_000
 """Most bytes that wait; beyond, the next messages are lost."""
 _DEPTH: Final = 1000

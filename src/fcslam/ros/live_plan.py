@@ -4,15 +4,13 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
-from fcslam.errors import InputError
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.camera import Calibration
+from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage, StampedTransform
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
-from fcslam.sources.bags.reader import ReadLaser
 from fcslam.sources.bags.rig import (
-    MountedSensor,
-    MountingError,
+    RecordedLaser,
     Rig,
     mounted_camera,
     mountings_of,
@@ -21,7 +19,7 @@ from fcslam.sources.bags.rig import (
     usual_scan,
 )
 from fcslam.sources.bags.sectors import are_sectors, joined_turns
-from fcslam.sources.bags.transforms import USUAL_BASES, Link, Mounting, NoTransformError, TransformTree
+from fcslam.sources.bags.transforms import USUAL_BASES, Link, NoTransformError, TransformTree
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY
 
 USUAL_ODOM: Final = "odom"
@@ -42,7 +40,7 @@ class LivePlan(NamedTuple):
     """How a live robot is read."""
 
     rig: Rig
-    lasers: tuple[ReadLaser, ...]
+    lasers: tuple[RecordedLaser, ...]
     edge: Link | None
     """Frames of the odometry in tf; None: it is on a topic, or there is none."""
 
@@ -99,9 +97,12 @@ class LivePlanner:
         self.base_frame = base_frame = self.known_base_frame
         in_sectors = [are_sectors(scans) for scans in self._first]
         turns = [joined_turns(scans) if is_in else scans for is_in, scans in zip(in_sectors, self._first, strict=True)]
-        first = list(map(usual_scan, turns))
+        lasers = tuple(
+            RecordedLaser(Topic(topic, self._topics.kinds[topic], len(scans)), usual_scan(scans), is_in)
+            for topic, scans, is_in in zip(self._topics.scans, turns, in_sectors, strict=True)
+        )
         try:
-            mountings = self._mountings(first, base_frame)
+            mountings = mountings_of(lasers, self.tree, base_frame, self._options.laser_poses)
         except NoTransformError as error:
             if not is_late:
                 return None
@@ -117,11 +118,10 @@ class LivePlanner:
         for topic, mounted in zip(self._topics.scans, mountings, strict=True):
             if tilt := tilt_note(mounted):
                 self._notify(f"the laser of {topic} is {tilt}")
-        lasers = tuple(ReadLaser(scan.beams, is_in) for scan, is_in in zip(first, in_sectors, strict=True))
         farthest_m = [max(scan.range_max_m for scan in scans) for scans in turns]
         for scans in self._first:
             scans.clear()
-        return LivePlan(rig_of(first, farthest_m, mountings, camera), lasers, self._edge)
+        return LivePlan(rig_of(lasers, farthest_m, mountings, camera), lasers, self._edge)
 
     def _find_odometry(self, is_late: bool) -> None:
         if self._topics.odometry is not None or self._edge is not None or not self._first[0]:
@@ -153,16 +153,6 @@ class LivePlanner:
                     "topic by --sensors odom-topic"
                 )
         return enough and (self._has_odometry or self.is_without_odometry)
-
-    def _mountings(self, first: list[ScanMessage], base_frame: str) -> list[Mounting]:
-        sensors = [
-            MountedSensor(topic, topic, self._topics.kinds[topic], scan.frame)
-            for topic, scan in zip(self._topics.scans, first, strict=True)
-        ]
-        try:
-            return mountings_of(sensors, self.tree, base_frame, self._options.laser_poses)
-        except MountingError as error:
-            raise InputError(str(error)) from error
 
 
 def missing_mounting(error: NoTransformError) -> str:

@@ -6,6 +6,9 @@ Messages are bytes here; ``sources.bags.codec`` decodes them, as for bags.
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
+MOST_ENDPOINTS = 10_000
+"""Most endpoints of a network that are remembered."""
+
 Deliver = Callable[[bytes], object]
 """Called with the bytes of each message, in a thread of the network."""
 Publish = Callable[[bytes], None]
@@ -48,15 +51,6 @@ class RosNetwork(Protocol):
 
     def close(self) -> None:
         """Leave the network; nothing is delivered afterwards."""
-
-
-def qos_conflict(offered: Quality, requested: Quality) -> str | None:
-    """Why a subscription gets nothing from a publisher; None if it does."""
-    if requested.reliable and not offered.reliable:
-        return "asks for reliable messages, and the publisher is best effort"
-    if requested.latched and not offered.latched:
-        return "asks for transient local messages, and the publisher is volatile"
-    return None
 
 
 def published(endpoints: Sequence[Endpoint]) -> dict[str, str]:

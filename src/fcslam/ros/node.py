@@ -18,9 +18,9 @@ from fcslam.errors import FcslamError, InputError
 from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
 from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock
-from fcslam.ros.inbox import Inbox
+from fcslam.ros.inbox import POLL_S, Inbox
 from fcslam.ros.live_plan import Notify
-from fcslam.ros.network import Endpoint, Quality, RosNetwork, qos_conflict
+from fcslam.ros.network import Endpoint, Quality, RosNetwork
 from fcslam.ros.outputs import MAP, OWN_MAP, POSE, Outputs, nanoseconds
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.sensors import LiveSensors
@@ -43,7 +43,6 @@ _NAMES_WAITING = 8
 """Most maps that wait to be saved; anybody on the network may ask for them."""
 _LINES_TOLD = 1000
 """Largest number of different lines that are printed; the names in some come from the network."""
-_POLL_S = 0.1
 _FLEET_PERIOD_S = 0.2
 """Time between two messages with the poses of the fleet."""
 _SETTLES_FOR_ODOMETRY = 4
@@ -69,7 +68,7 @@ def await_sensors(
         except InputError:
             if time.monotonic() > end_s:
                 raise
-            time.sleep(_POLL_S)
+            time.sleep(POLL_S)
 
 
 class RobotNode:
@@ -135,7 +134,7 @@ class RobotNode:
         is_silent = False
         try:
             while not self._stop.is_set():
-                message = self._inbox.get(_POLL_S)
+                message = self._inbox.get(POLL_S)
                 now_s = time.monotonic()
                 before = self.scans
                 records = (
@@ -357,27 +356,11 @@ class RobotNode:
         return any(point.publishes and not point.own and point.topic == self._map_topic for point in endpoints)
 
     def watch_network(self) -> None:
-        """Tell once which peers get nothing, and whether another robot has this name."""
-        endpoints = self._network.endpoints()
-        own = [point for point in endpoints if point.own]
-        for point in endpoints:
-            for mine in () if point.own else own:
-                if mine.topic == point.topic:
-                    self._tell_once(_mismatch(mine, point))
-        if self._has_namesake(endpoints):
+        """Tell once whether another robot has this name."""
+        if self._has_namesake(self._network.endpoints()):
             self._tell_once(f"another node publishes {self._map_topic} now, too; give each robot a name of its own")
 
     def _tell_once(self, line: str) -> None:
         if line and line not in self._told and len(self._told) < _LINES_TOLD:
             self._told.add(line)
             self._notify(line)
-
-
-def _mismatch(mine: Endpoint, other: Endpoint) -> str:
-    if mine.kind != other.kind:
-        return f"{mine.topic}: another node takes it as {other.kind}, and not as {mine.kind}"
-    if mine.publishes == other.publishes:
-        return ""
-    offered, requested = (mine, other) if mine.publishes else (other, mine)
-    conflict = qos_conflict(offered.quality, requested.quality)
-    return f"{mine.topic}: a subscription {conflict}, so it gets nothing; change its QoS" * bool(conflict)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 GRID, POSE, PATH = "nav_msgs/OccupancyGrid", "geometry_msgs/PoseWithCovarianceStamped", "nav_msgs/Path"
 MARKERS, DIAGNOSTICS = "visualization_msgs/MarkerArray", "diagnostic_msgs/DiagnosticArray"
+MARKER, STATUS = "visualization_msgs/Marker", "diagnostic_msgs/DiagnosticStatus"
 
 POSES, POSE_STAMPED = "geometry_msgs/PoseArray", "geometry_msgs/PoseStamped"
 
@@ -47,9 +48,7 @@ PATH_STEP_M: Final = 0.1
 LONGEST_PATH: Final = 5000
 """Most poses of the published path, about; a longer path has longer steps."""
 LINE_WIDTH_M: Final = 0.05
-_OK, _WARN = 0, 1
 SPHERE_M: Final = 0.3
-_LINE_LIST, _SPHERE_LIST = 5, 7
 
 
 class Outputs:
@@ -59,6 +58,7 @@ class Outputs:
         """``tf``: topic of the transforms; those without a leading slash are in the namespace."""
         self._network, self._namespace, self._map_frame, self._tf = network, namespace, map_frame, tf
         self._codec = MessageCodec(ros1=False)
+        self._levels, self._shapes = self._codec.type_of(STATUS), self._codec.type_of(MARKER)
         self._lock = threading.Lock()
         self._publishers: dict[str, Publish] = {}
         """By topic; new ones are made under the lock."""
@@ -97,7 +97,7 @@ class Outputs:
 
     def closures(self, stamp_ns: int, ends_xy: FloatArray) -> None:
         """Publish the accepted closures as lines between two places (N, 2, 2), metres in ``map``."""
-        lines = self._marker(stamp_ns, "closures", _LINE_LIST, LINE_WIDTH_M, (0.1, 0.6, 0.2), ends_xy)
+        lines = self._marker(stamp_ns, "closures", self._shapes.LINE_LIST, LINE_WIDTH_M, (0.1, 0.6, 0.2), ends_xy)
         self._send("closures", MARKERS, self._codec.make(MARKERS, markers=[lines]))
 
     def frontiers(self, now_ns: int, free_xy: FloatArray, taken_xy: FloatArray, T_map_goal: FloatArray | None) -> None:
@@ -109,7 +109,7 @@ class Outputs:
             self._begin(FLEET_FRONTIERS, MARKERS, LATCHED)
             self._begin(FLEET_GOAL, POSE_STAMPED, LATCHED)
             markers = [
-                self._marker(now_ns, name, _SPHERE_LIST, SPHERE_M, colour, points)
+                self._marker(now_ns, name, self._shapes.SPHERE_LIST, SPHERE_M, colour, points)
                 for name, colour, points in (("free", (0.9, 0.6, 0.1), free_xy), ("taken", (0.1, 0.4, 0.9), taken_xy))
             ]
             self._send(FLEET_FRONTIERS, MARKERS, self._codec.make(MARKERS, markers=markers))
@@ -125,7 +125,7 @@ class Outputs:
                 self._status(
                     f"map {one.map_index}",
                     robot,
-                    _WARN if one.drives else _OK,
+                    self._levels.WARN if one.drives else self._levels.OK,
                     one.verdict,
                     {
                         "map": one.map_index,
@@ -182,7 +182,7 @@ class Outputs:
                 self._status(
                     f"robot {mate.robot}",
                     mate.robot,
-                    _OK,
+                    self._levels.OK,
                     f"map {mate.map_index}",
                     {
                         "map": mate.map_index,
@@ -197,28 +197,29 @@ class Outputs:
                 for mate in teammates
             ]
             statuses += [
-                self._status(f"maps {a} and {b}", "", _WARN, why, {"map_a": a, "map_b": b})
+                self._status(f"maps {a} and {b}", "", self._levels.WARN, why, {"map_a": a, "map_b": b})
                 for (a, b), why in separations
             ]
             self._diagnose(FLEET_STATUS, now_ns, statuses)
 
     def event(self, stamp_ns: int, robot: str, text: str) -> None:
         """Publish one event of the fleet's map on the topic of diagnostics."""
-        status = self._status(f"fcslam: {robot}: fleet", robot, _OK, text, {"event": "fleet"})
+        status = self._status(f"fcslam: {robot}: fleet", robot, self._levels.OK, text, {"event": "fleet"})
         self._diagnose(DIAGNOSTICS_TOPIC, stamp_ns, [status])
 
     def diagnostics(
         self, stamp_ns: int, robot: str, trouble: str, values: Mapping[str, object], well: str = "mapping"
     ) -> None:
         """Publish the state of the robot: ``trouble``, or ``well`` if that is empty."""
-        status = self._status(f"fcslam: {robot}", robot, _WARN if trouble else _OK, trouble or well, values)
+        level = self._levels.WARN if trouble else self._levels.OK
+        status = self._status(f"fcslam: {robot}", robot, level, trouble or well, values)
         self._diagnose(DIAGNOSTICS_TOPIC, stamp_ns, [status])
 
     def _status(self, name: str, hardware: str, level: int, message: str, values: Mapping[str, object]) -> Any:
         make = self._codec.make
         pairs = [make("diagnostic_msgs/KeyValue", key=key, value=str(value)) for key, value in values.items()]
         return make(
-            "diagnostic_msgs/DiagnosticStatus",
+            STATUS,
             level=level,
             name=name,
             message=message,
@@ -249,9 +250,9 @@ class Outputs:
         """A marker of points (..., 2), metres in ``map``."""
         make, vector = self._codec.make, self._codec.vector
         r, g, b = colour
-        width_m = 0.0 if kind == _LINE_LIST else scale_m
+        width_m = 0.0 if kind == self._shapes.LINE_LIST else scale_m
         return make(
-            "visualization_msgs/Marker",
+            MARKER,
             header=self._codec.header(stamp_ns, self._map_frame),
             ns=name,
             type=kind,

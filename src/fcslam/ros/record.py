@@ -11,13 +11,11 @@ from typing import Any
 
 from fcslam.errors import InputError
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC
-from fcslam.ros.inbox import Inbox, ReceivedMessage
+from fcslam.ros.inbox import POLL_S, Inbox, ReceivedMessage
 from fcslam.ros.live_plan import Notify
 from fcslam.ros.network import RosNetwork
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.codec import full_name, typestore
-
-_POLL_S = 0.2
 
 
 def record(
@@ -42,7 +40,7 @@ def record(
             recording = _Recording(Path(staging, output.stem))
             try:
                 recording.writer.open()
-                while (message := inbox.get(_POLL_S)) is not None or not stop.is_set():
+                while (message := inbox.get(POLL_S)) is not None or not stop.is_set():
                     if message is not None:
                         recording.write(message, kinds[message.topic])
                         counts[message.topic] += 1

@@ -14,7 +14,7 @@ from functools import cache
 from typing import Any, Final
 
 from fcslam.errors import InputError
-from fcslam.ros.network import Deliver, Endpoint, Publish, Quality
+from fcslam.ros.network import MOST_ENDPOINTS, Deliver, Endpoint, Publish, Quality
 
 _log = logging.getLogger(__name__)
 
@@ -22,8 +22,6 @@ INSTALL: Final = "pip install 'fcslam[ros2]'"
 _PARTICIPANTS: Final = 32
 """Most participants on one computer that are asked whether they are there, where there is no multicast."""
 _LOOPBACK: Final = "127.0.0.1"
-_ENDPOINTS_READ = _ENDPOINTS_KNOWN = 10_000
-"""Most endpoints that are read at once, and that are remembered."""
 _MESSAGES_TAKEN = 64
 _WAIT_NS = 200_000_000
 _BLOCKING_NS = 100_000_000
@@ -71,7 +69,7 @@ class Ros2Network:
         """As in RosNetwork."""
         with self._lock:  # reads what changed only: in a large network, reading all takes tens of milliseconds
             for publishes, reader in self._builtin:
-                for sample in reader.take(_ENDPOINTS_READ):
+                for sample in reader.take(MOST_ENDPOINTS):
                     self._see(publishes, sample)
             return list(self._known.values())
 
@@ -80,7 +78,7 @@ class Ros2Network:
         is_alive = sample.sample_info.instance_state == self._alive
         if not is_alive or topic is None or kind is None:
             self._known.pop(str(sample.key), None)
-        elif len(self._known) < _ENDPOINTS_KNOWN:
+        elif len(self._known) < MOST_ENDPOINTS:
             mine = sample.participant_key == self._participant.guid
             self._known[str(sample.key)] = Endpoint(topic[1], kind, publishes, _quality_of(sample.qos), mine)
 

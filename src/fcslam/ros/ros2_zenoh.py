@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from fcslam.errors import InputError
-from fcslam.ros.network import Deliver, Endpoint, Publish, Quality
+from fcslam.ros.network import MOST_ENDPOINTS, Deliver, Endpoint, Publish, Quality
 from fcslam.ros.ros2 import dds_type, kind_of
 from fcslam.sources.bags.codec import MessageCodec, full_name
 
@@ -30,13 +30,9 @@ _SETTINGS: Final = {
 }
 """These are also the values of rmw_zenoh's own session configuration."""
 _ADMIN, _NODE = "@ros2_lv", 0
-_KINDS: Final = {"MP": True, "MS": False}
-"""Whether an endpoint publishes, by its name in a token."""
 _RELIABLE, _BEST_EFFORT, _LATCHED = "1", "2", "1"
 _HEARTBEAT_S = 0.5
 """Period at which a publisher of latched messages says which was its last one."""
-_PARTS = 13
-_ENDPOINTS_KNOWN = 10_000
 
 
 class ZenohNetwork:
@@ -159,7 +155,7 @@ class ZenohNetwork:
         with self._lock:
             if sample.kind == self._zenoh.SampleKind.DELETE:
                 self._known.pop(token, None)
-            elif found is not None and len(self._known) < _ENDPOINTS_KNOWN:
+            elif found is not None and len(self._known) < MOST_ENDPOINTS:
                 self._known[token] = found
 
 
@@ -209,15 +205,15 @@ def quality_text(quality: Quality) -> str:
 
 def endpoint_of(token: str, own: str) -> Endpoint | None:
     """The publisher or subscription of a token; None: it is of something else. ``own`` is the id of this session."""
-    parts = token.split("/")
-    if len(parts) < _PARTS or parts[5] not in _KINDS:
-        return None
-    kind = kind_of(parts[10].replace("%", "/"))
-    if kind is None:
-        return None
-    reliability, durability, *_ = f"{parts[12]}:".split(":")
-    quality = Quality(reliability in ("", _RELIABLE), durability == _LATCHED)
-    return Endpoint(parts[9].replace("%", "/"), kind, _KINDS[parts[5]], quality, parts[2] == own)
+    match token.split("/"):
+        case [_, _, session, _, _, ("MP" | "MS") as end, _, _, _, topic, of_type, _, qos, *_]:
+            kind = kind_of(of_type.replace("%", "/"))
+            if kind is None:
+                return None
+            reliability, durability, *_ = f"{qos}:".split(":")
+            quality = Quality(reliability in ("", _RELIABLE), durability == _LATCHED)
+            return Endpoint(topic.replace("%", "/"), kind, end == "MP", quality, session == own)
+    return None
 
 
 def _first_line(error: Exception) -> str:

@@ -35,15 +35,15 @@ from fcslam.sources.bags.messages import (
     transforms_of,
 )
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.pairing import Message, PosedImage, PosedScan
+from fcslam.sources.bags.pairing import MAX_GAP_S, Message, PosedImage, PosedScan
 from fcslam.sources.bags.reader import Numbered, SensorReader
 from fcslam.sources.bags.topics import info_beside
 from fcslam.sources.bags.transforms import NoTransformError
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import MAX_STEP_BACK_S
-from fcslam.sources.point_clouds import directions_in
+from fcslam.sources.point_clouds import directions_in, scan_of_cloud
 
-ODOMETRY_PATIENCE_S = 1.0
+ODOMETRY_PATIENCE_S = MAX_GAP_S
 """Time that a scan waits for its odometry."""
 MERGING_PATIENCE_S = 0.3
 """Time that scans of one laser wait for those of another, so a laser that stops does not delay the pose."""
@@ -229,8 +229,8 @@ class LiveSensors:
                 self.planner.awaited[topic] = missing_mounting(error)
                 return None
         if topic not in self._directions:
-            self._directions[topic] = directions_in([cloud.cloud], mounting)
-        return cloud.scan(mounting._replace(directions=self._directions[topic]), self._options.cloud_band)
+            self._directions[topic] = directions_in([cloud], mounting)
+        return scan_of_cloud(cloud, mounting._replace(directions=self._directions[topic]), self._options.cloud_band)
 
     def _transforms(self, content: object, received_ns: int) -> list[Message]:
         transforms = list(transforms_of(content, received_ns))

@@ -4,8 +4,7 @@ from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag
 from fcslam.sources.faults import Fault, FaultCount, Faults
 from fcslam.sources.formats import check_copies, open_fleet, open_source
-from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
-from fcslam.sources.split import split
+from fcslam.sources.source import WHOLE, ScanRange, Source, Survey, split
 
 __all__ = [
     "BAG_SUFFIXES",

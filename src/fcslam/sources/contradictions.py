@@ -12,20 +12,19 @@ from math import hypot, inf, remainder, tau
 import numpy as np
 
 from fcslam.records import LaserScan, Ranges
-from fcslam.sources.faults import Audit, Fault
+from fcslam.sources.faults import FEWEST, Audit, Fault
+from fcslam.sources.motion import STILL_M
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import Pose
 
-STILL_M, STILL_RAD = 0.005, 0.003
-"""Odometry that moved less stands still."""
+STILL_RAD = 0.003
+"""Odometry that turned by less stands still."""
 CHANGE_M, CHANGE = 0.3, 0.05
 """A range that differs by more, in metres and as a share of it, measures something else."""
 CHANGED = 0.6
 """Share of the beams that measure something else, if the scan changed."""
 FEWEST_RETURNS = 20
 """Scans with fewer common returns are not compared."""
-SCANS_THAT_CHANGED = 10
-"""So many scans in a row that changed while the odometry said nothing show that it measures nothing."""
 SLIGHTLY_CHANGED = 0.1
 """Share of the beams that measure something else, of a robot that moved on a little."""
 FROZEN = "stands still while the scans change"
@@ -84,7 +83,7 @@ class WheelCheck:
             self._changed = self._changed + 1 if share > CHANGED else 0
             if not share > SLIGHTLY_CHANGED:  # true for NaN
                 self.certain_s = scan.stamp
-        if self._changed >= SCANS_THAT_CHANGED:
+        if self._changed >= FEWEST:
             self.fault = FROZEN if self._path.says_something else self._path.fault
         return self.fault is not None
 

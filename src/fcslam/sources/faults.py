@@ -29,8 +29,8 @@ class Fault(StrEnum):
     NO_RETURN = "scans without a return, which clear nothing"
 
 
-WARNED_FROM = 10
-"""Fewer faults of one kind give no warning."""
+FEWEST = 10
+"""Fewer scans, poses or faults of one kind show nothing."""
 _CONSEQUENCES = {
     Fault.FROZEN_ODOMETRY: "the odometry stood still while the scans changed; from ten in a row on, scan matching "
     "alone gives the motion",
@@ -71,7 +71,7 @@ class Faults:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences about faults that may make the map worse."""
-        return tuple(text for kind, text in _CONSEQUENCES.items() if self[kind].count >= WARNED_FROM)
+        return tuple(text for kind, text in _CONSEQUENCES.items() if self[kind].count >= FEWEST)
 
     def __str__(self) -> str:
         return ", ".join(self._describe(kind) for kind in Fault if kind in self.counts) or "no faults"

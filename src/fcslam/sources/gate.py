@@ -19,17 +19,15 @@ from typing import TypeVar
 from fcslam.errors import SourceError
 from fcslam.geometry.beams import misfit
 from fcslam.records import Beams
-from fcslam.sources.faults import Audit, Fault, Faults
+from fcslam.sources.faults import FEWEST, Audit, Fault, Faults
 from fcslam.sources.source import WHOLE, ScanRange
 
 MAX_STEP_BACK_S = 2.0
 """Largest tolerated step back in time."""
 TOLERATED_SHARE = 0.01
 """Largest share of inconsistent scans in a recording."""
-SCANS_OF_NEW_CLOCK = 10
-"""Number of misplaced scans in a row, in their order, after which the clock has stepped back."""
-SCANS_THAT_VOTE = 20
-"""Number of first scans that decide which beams the laser has."""
+FIRST_MESSAGES = 20
+"""Number of first messages that decide what a sensor is, as which beams a laser has."""
 
 Entry = TypeVar("Entry")
 
@@ -69,7 +67,7 @@ class ScanGate:
             if self._misplaced and not 0.0 <= stamp - self._misplaced[-1][1] <= MAX_STEP_BACK_S:
                 self._misplaced.clear()
             self._misplaced.append((number, stamp))
-            if self._has_stepped or len(self._misplaced) < SCANS_OF_NEW_CLOCK:
+            if self._has_stepped or len(self._misplaced) < FEWEST:
                 self._audit.add(Fault.MISPLACED_SCAN, number, step_s=step_back_s)
                 return False
             self._has_stepped = True
@@ -120,7 +118,7 @@ def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_coun
             f"{path}: {faults.unit} {other.first_line}: {other.count} scans are not of the laser of the first ones "
             f"({scan_count} scans are): other beams; give one recording for each laser"
         )
-    skipped_at_step = (SCANS_OF_NEW_CLOCK - 1) * faults[Fault.CLOCK_STEP].count
+    skipped_at_step = (FEWEST - 1) * faults[Fault.CLOCK_STEP].count
     if misplaced.count - skipped_at_step > TOLERATED_SHARE * scan_count:
         raise SourceError(
             f"{path}: {faults.unit} {misplaced.first_line}: time jumps back by up to {misplaced.largest_s:.6g} s, as "

@@ -13,7 +13,7 @@ from fcslam.sources.pose import Pose, relative_pose
 SAMPLES: Final = 9
 """Poses by odometry that the motion during a sweep is fitted to."""
 LARGEST_SPEED: Final = 10.0
-"""Largest speed of a robot, m/s and rad/s; odometry that starts at zero again shows more and says nothing."""
+"""Largest speed of a robot that maps a building, m/s and rad/s; odometry that starts at zero again shows more."""
 LARGEST_ACCELERATION: Final = 50.0
 """Largest acceleration of a robot, m/s^2 and rad/s^2; odometry that jumps shows more."""
 
@@ -24,8 +24,8 @@ FEWEST_STEPS: Final = 4
 """Steps of a moving robot that show it."""
 LONGEST_UPDATE_S: Final = 0.35
 """A robot whose odometry does not change for longer stands still."""
-LEAST_STEP_M, LEAST_STEP_RAD = 0.005, 0.005
-"""A smaller change is that of an encoder at a low speed."""
+STILL_M, LEAST_STEP_RAD = 0.005, 0.005
+"""A smaller change is that of a robot at rest, or of an encoder at a low speed."""
 
 
 class Reading(Protocol):
@@ -71,7 +71,7 @@ class OdometryUpdates:
             if max(abs(x), abs(y), abs(theta)) < ROUNDING:
                 self._repeats += 1
                 return not 0.0 <= held_s <= self.period_s
-            if hypot(x, y) > LEAST_STEP_M or abs(theta) > LEAST_STEP_RAD:
+            if hypot(x, y) > STILL_M or abs(theta) > LEAST_STEP_RAD:
                 self._moves += 1
                 if self._repeats and 0.0 < held_s <= LONGEST_UPDATE_S:
                     self._steps += 1

@@ -7,19 +7,17 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.errors import SourceError
+from fcslam.sources.faults import FEWEST
+from fcslam.sources.motion import LARGEST_SPEED
 from fcslam.sources.pose import Pose, relative_pose
 
 RESOLUTION_M: Final = 1e-3
 RESOLUTION_RAD: Final = 1e-4
 """Odometry that changes by less over a whole recording never changes."""
-FEWEST_POSES: Final = 10
-"""Fewer poses are not judged."""
 LEAST_TRAVEL_M: Final = 1.0
 """A robot that drove less far may not have turned at all."""
 SIDEWAYS: Final = 0.1
 """Odometry without turns that moves sideways by a larger share of its travel has no heading."""
-FASTEST_M_S: Final = 10.0
-"""Larger speeds are those of no robot that maps a building."""
 LEAST_DURATION_S: Final = 10.0
 """The stamps of a shorter drive may all be wrong."""
 
@@ -55,7 +53,7 @@ class PathSummary:
             self.length_m += step_m
             if stamp > self._stamp:
                 self._steps += 1
-                self._fast += step_m > FASTEST_M_S * (stamp - self._stamp)
+                self._fast += step_m > LARGEST_SPEED * (stamp - self._stamp)
             if not self.says_something:
                 self._sideways_m += abs(relative_pose(self._pose, pose)[1])
                 self._leaves |= hypot(pose[0] - self._first[0], pose[1] - self._first[1]) > RESOLUTION_M
@@ -78,13 +76,13 @@ class PathSummary:
     @property
     def is_too_fast(self) -> bool:
         """Whether the whole drive and most of its steps are faster than any robot; a jump alone does not count."""
-        is_fast = self.duration_s >= LEAST_DURATION_S and self.length_m > FASTEST_M_S * self.duration_s
+        is_fast = self.duration_s >= LEAST_DURATION_S and self.length_m > LARGEST_SPEED * self.duration_s
         return is_fast and 2 * self._fast > self._steps
 
     @property
     def fault(self) -> str | None:
         """Why these poses are not odometry, as the end of a sentence; None if they can be."""
-        if self.count < FEWEST_POSES or self.says_something:
+        if self.count < FEWEST or self.says_something:
             return None
         if not self._leaves and not self._turns:
             return f"never changes in {self.count} poses"

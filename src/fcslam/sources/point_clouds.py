@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.records import Beams, FloatArray, Ranges, Sweep
+from fcslam.sources.bags.messages import ScanMessage
 from fcslam.sources.pose import Pose
 from fcslam.sources.returns import is_apart
 
@@ -31,7 +32,7 @@ _FEWEST_DIRECTIONS: Final = 50
 FARTHEST_M: Final = 100.0
 """Farther returns are left out."""
 SAME_SURFACE_M: Final = 0.05
-"""Returns of a direction that are this much farther than the nearest one are of the same surface."""
+"""Returns that are closer, along a direction or to a plane, are of the same surface."""
 LARGEST_GAP: Final = 3
 """Directions between two returns that may be neighbours on a surface."""
 GAP_M, GAP_PER_SPACING = 0.15, 3.0
@@ -49,7 +50,6 @@ _FEWEST_FLOORS, _SAME_FLOOR_RAD = 8, radians(4.0)
 """Clouds that show it at least, and the largest deviation of their floors from the middle one."""
 FLOOR_REACH_M: Final = 12.0
 """The floor is fitted to points up to this distance."""
-FLOOR_NOISE_M: Final = 0.05
 _FLOOR_POINTS, _FLOOR_SAMPLES = 1500, 200
 """Most points that a floor is sought in, and planes through three of them that are tried."""
 _FEWEST_ON_FLOOR = 30
@@ -88,6 +88,8 @@ class CloudBand(NamedTuple):
 class PointCloud(NamedTuple):
     """The returns of one message."""
 
+    stamp: float
+    frame: str
     points: FloatArray
     """Shape (N, 3), metres, finite, in the frame of the sensor."""
     times_s: FloatArray
@@ -107,20 +109,6 @@ class CloudMounting(NamedTuple):
     directions: int = DIRECTIONS
 
 
-class CloudScan(NamedTuple):
-    """The ranges in the level frame of the sensor."""
-
-    beams: Beams
-    ranges_m: Ranges
-    """Shape (beams.beam_count,); NaN: nothing measured in the band."""
-    offset_s: float
-    """Stamp of the scan after that of the message."""
-    sweep: Sweep | None
-    """When the directions were measured; None: at the stamp, or nothing is known."""
-    is_turn: bool
-    """Whether they were measured one after the other."""
-
-
 class Floor(NamedTuple):
     """The plane ``normal @ p = distance_m``, with ``normal`` up."""
 
@@ -130,8 +118,8 @@ class Floor(NamedTuple):
 
 def scan_of_cloud(
     cloud: PointCloud, mounting: CloudMounting, band: CloudBand, motion: Sweep | None = None
-) -> CloudScan:
-    """The nearest returns of a cloud in a band of heights.
+) -> ScanMessage:
+    """The nearest returns of a cloud in a band of heights, in the level frame of the sensor; NaN: none is in it.
 
     If ``motion`` says how ``base`` moves around the stamp of the scan, for a cloud whose directions are in no order,
     each point is moved to where it is seen at the stamp.
@@ -169,7 +157,10 @@ def scan_of_cloud(
     ranges_m = _ranges(xy[kept], index, first, count)
     first = (first + count // 2) % count - count // 2
     beams = Beams(count, first * spacing_rad, spacing_rad)
-    return CloudScan(beams, ranges_m, offset_s, sweep, turn is not None and is_timed)
+    scan = ScanMessage(cloud.stamp + offset_s, cloud.frame, beams, 0.0, FARTHEST_M, ranges_m, sweep=sweep)
+    if sweep is None or (turn is not None and is_timed):
+        return scan
+    return scan._replace(ranges_at_stamp=lambda motion: scan_of_cloud(cloud, mounting, band, motion).raw_ranges_m)
 
 
 def directions_in(clouds: Iterable[PointCloud], mounting: CloudMounting) -> int:
@@ -254,7 +245,7 @@ def _lowest_plane(points: FloatArray, is_height_known: bool, largest_tilt_rad: f
     normals = np.vstack(([0.0, 0.0, 1.0], normals[level] / normals[level, 2:]))
     distances_m = np.append(0.0, np.sum(normals[1:] * corners[level, 0], axis=1))
     heights_m = normals @ np.ascontiguousarray(points.T) - distances_m[:, None]
-    scores = np.sum(heights_m < FLOOR_NOISE_M, axis=1) - 2 * np.sum(heights_m < -FLOOR_NOISE_M, axis=1)
+    scores = np.sum(heights_m < SAME_SURFACE_M, axis=1) - 2 * np.sum(heights_m < -SAME_SURFACE_M, axis=1)
     best = int(np.argmax(scores))
     is_of_mounting = is_height_known and scores[0] > _GOOD_MOUNTING * scores[best]
     if scores[best] < _FEWEST_ON_FLOOR or is_of_mounting:
@@ -263,7 +254,7 @@ def _lowest_plane(points: FloatArray, is_height_known: bool, largest_tilt_rad: f
 
 
 def _fitted(floor: Floor, points: FloatArray) -> Floor | None:
-    own = points[np.abs(points @ floor.normal - floor.distance_m) < FLOOR_NOISE_M]
+    own = points[np.abs(points @ floor.normal - floor.distance_m) < SAME_SURFACE_M]
     if len(own) < _FEWEST_ON_FLOOR:
         return None
     middle = own.mean(axis=0)

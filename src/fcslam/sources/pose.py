@@ -8,6 +8,8 @@ from fcslam.records import FloatArray
 Pose = se2.Pose
 UNKNOWN_POSE: Pose = (nan, nan, nan)
 """Odometry of a robot that has none."""
+LARGEST_COORDINATE = 1e7
+"""Metres or radians; a larger one is damage."""
 
 
 def relative_pose(T_a_b: Pose, T_a_c: Pose) -> Pose:
@@ -15,13 +17,6 @@ def relative_pose(T_a_b: Pose, T_a_c: Pose) -> Pose:
     dx, dy = T_a_c[0] - T_a_b[0], T_a_c[1] - T_a_b[1]
     c, s = cos(T_a_b[2]), sin(T_a_b[2])
     return c * dx + s * dy, c * dy - s * dx, remainder(T_a_c[2] - T_a_b[2], tau)
-
-
-def composed_pose(T_a_b: Pose, T_b_c: Pose) -> Pose:
-    """``T_a_c``, like ``se2.compose``."""
-    c, s = cos(T_a_b[2]), sin(T_a_b[2])
-    x, y, theta = T_b_c
-    return T_a_b[0] + c * x - s * y, T_a_b[1] + s * x + c * y, remainder(T_a_b[2] + theta, tau)
 
 
 def interpolated_pose(T_a_b: Pose, T_a_c: Pose, share: float) -> Pose:

@@ -3,7 +3,6 @@
 - Nothing: nearly no beam has a return.
 - Another unit: the values are too large for a 2D LiDAR, and as varied as ranges. A driver that sends a large number for
   no return sends few different ones.
-- A counter that overflows: beside beams near the largest value are beams near 0, and both have many values.
 - Whole numbers: no laser rounds ranges to metres. Intensities are whole numbers.
 - A placeholder: one value repeats exactly in many beams at most places of a drive, and values near it are rare. Along a
   wall they are not, as the beams beside the nearest one are a little longer, however coarse the ranges are.
@@ -19,12 +18,11 @@ import numpy as np
 
 from fcslam.errors import SourceError
 from fcslam.records import FloatArray, LaserScan, Ranges, frozen
+from fcslam.sources.faults import FEWEST
 from fcslam.sources.pose import Pose
 
 FEWEST_RETURNS = 0.02
 """Share of the beams."""
-FEWEST_SCANS = 10
-"""A recording with fewer scans is not judged."""
 LONGEST_USUAL_M = 50.0
 """Half of the returns of a 2D LiDAR are nearer."""
 _VARIED, _MOST_COMMON = 0.5, 8
@@ -33,15 +31,6 @@ _TOO_FAR = 0.6
 """Share of varied values beyond the maximum that no laser has."""
 _WHOLE, _FEWEST_VALUES = 0.95, 3
 """Share of the different values that are whole where all are, and their least number."""
-_MILLIMETRES = 900.0
-"""Values of which half are larger are millimetres and not centimetres."""
-_TOP, _BOTTOM = 0.95, 0.05
-"""Parts of the largest value above and below which a counter may overflow between two beams."""
-_OVERFLOWS, _FEWEST_OVERFLOWS, _FEWEST_ENDS = 0.01, 15, 5
-"""Share of the beams in the upper part that have one in the lower part beside them, their least number, and the least
-number of their values."""
-_SMOOTH = 0.05
-"""Largest usual difference of ranges side by side, as a share of the largest range."""
 _REPEATED, _PLACES = 0.1, 0.5
 """Share of the beams that have a placeholder, and of the places at which as many have it."""
 _NEAR, _ABOVE_NEAR = 2, 5
@@ -117,7 +106,7 @@ class RangeSample:
         """The values that are not ranges."""
         places = [sample for sample in self._samples if sample.is_elsewhere]
         beams = sum(len(sample.values) for sample in places)
-        if len(places) < FEWEST_SCANS:
+        if len(places) < FEWEST:
             return ()
         values, counts = np.unique(np.concatenate([_returns(place) for place in places]), return_counts=True)
         found = []
@@ -137,7 +126,7 @@ class RangeSample:
             which: the laser, empty or with a blank before it.
             remedy: what to check if nearly no beam has a return.
         """
-        if len(self._samples) >= FEWEST_SCANS and (problem := self._problem(which, remedy)):
+        if len(self._samples) >= FEWEST and (problem := self._problem(which, remedy)):
             raise SourceError(f"{path}: {problem}")
 
     def _problem(self, which: str, remedy: str) -> str:
@@ -156,19 +145,9 @@ class RangeSample:
                 "in the driver and record again"
             )
         if middle > LONGEST_USUAL_M and (large is beyond or _is_varied(returns)):
-            unit = (
-                "millimetres: divide them by 1000"
-                if middle > _MILLIMETRES
-                else "centimetres: divide them by 100 (inches: by 39.37)"
-            )
             return (
-                f"half of the ranges{which} are above {middle:g}, too much for metres {limits}; they seem to be "
-                f"{unit}{', or intensities,' * is_whole} and give the recording again"
-            )
-        if _overflows(self._samples):
-            return (
-                f"the ranges{which} go from {returns.max():.2f} m to 0 from one beam to the next, as a counter that "
-                "overflows; let the driver use numbers with more bits and record again"
+                f"half of the ranges{which} are above {middle:g}, too much for metres {limits}; they seem to be in "
+                f"another unit{', or intensities' * is_whole}: correct them and give the recording again"
             )
         if is_whole:
             return (
@@ -208,30 +187,6 @@ def _returns(sample: _Sample) -> FloatArray:
     with np.errstate(invalid="ignore"):
         is_return = (values > max(sample.range_min_m, 0.0)) & (values < sample.range_max_m)
     return values[is_return]
-
-
-def _overflows(samples: Sequence[_Sample]) -> bool:
-    largest = max((_returns(one).max(initial=0.0) for one in samples), default=0.0)
-    tops, ends = 0, []
-    for sample in samples:
-        one, other = _neighbours(sample, largest)
-        is_top = one > _TOP * largest
-        tops += int(np.count_nonzero(is_top))
-        ends.append(np.stack((one, other))[:, is_top & (other < _BOTTOM * largest)])
-    found = np.concatenate(ends, axis=1) if ends else np.empty((2, 0))
-    if found.shape[1] <= max(_OVERFLOWS * tops, _FEWEST_OVERFLOWS):
-        return False
-    steps_m = np.concatenate([np.abs(np.subtract(*_neighbours(sample, largest))) for sample in samples])
-    return bool(np.median(steps_m) < _SMOOTH * largest) and all(len(np.unique(each)) >= _FEWEST_ENDS for each in found)
-
-
-def _neighbours(sample: _Sample, largest: float) -> tuple[Ranges, Ranges]:
-    """Returns side by side, each pair in both orders, shapes (N,)."""
-    values = sample.values
-    with np.errstate(invalid="ignore"):
-        known = (values > 0.0) & (values <= largest)
-    first, second = (values[part][known[:-1] & known[1:]] for part in (slice(-1), slice(1, None)))
-    return np.concatenate((first, second)), np.concatenate((second, first))
 
 
 def _is_beyond(sample: _Sample) -> np.ndarray:

@@ -36,6 +36,7 @@ from fcslam.sources.bags.codec import (
 )
 from fcslam.sources.bags.container import ZSTD, BagPart, Topic, check_order, open_parts
 from fcslam.sources.bags.messages import (
+    LONGEST_NAME,
     BeamsError,
     OdometryReading,
     ScanMessage,
@@ -49,11 +50,9 @@ from fcslam.sources.bags.records import MessagePlace, StoredMessage
 from fcslam.sources.bags.transforms import Link, TransformTree, differ
 from fcslam.untrusted import unpack
 
-_LATEST_NS: Final = 2**63 - 1
+_LATEST_NS: Final = int(np.iinfo(np.int64).max)
 """Of a damaged file, some times are larger."""
 _ROWS_AT_ONCE: Final = 256
-_LONGEST_TOPIC: Final = 255
-"""Characters in a topic's name, as in ROS 2."""
 _KEPT: Final = (*LASER_SCANS, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
 _COUNTED: Final = (*SCANS, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
 _READ: Final = (*_COUNTED, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, FIX)
@@ -242,7 +241,7 @@ class DecodedBag:
 def _messages(part: BagPart) -> Iterator[StoredMessage]:
     with part.translated():
         for message in part.file.messages():
-            if len(message.topic) > _LONGEST_TOPIC:
+            if len(message.topic) > LONGEST_NAME:
                 raise SourceError(
                     f"{part.path}: a topic's name has {len(message.topic)} characters; copy the bag again"
                 )

@@ -8,7 +8,7 @@ from typing import TypeVar
 from fcslam.errors import SourceError
 from fcslam.sources.bags.camera import Calibration, calibration_of
 from fcslam.sources.bags.census import BagMessage
-from fcslam.sources.bags.clouds import CloudMessage, cloud_mounting, cloud_of, given_cloud_mounting
+from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import IMAGE, LASER_SCANS
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import ScanMessage
@@ -16,10 +16,11 @@ from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.topics import calibration_beside
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, is_fixed
-from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud, directions_in, leaning
+from fcslam.sources.gate import FIRST_MESSAGES
+from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud, directions_in, leaning, scan_of_cloud
 
-_CLOUDS_FOR_FLOOR, _CLOUDS_TRIED = 20, 200
-"""Clouds that show the floor and the directions of the sensor, spread over the first ones."""
+_CLOUDS_TRIED = 10 * FIRST_MESSAGES
+"""First clouds over which those are spread that show the floor and the directions of the sensor."""
 
 Found = TypeVar("Found")
 
@@ -74,9 +75,9 @@ class BagScans:
             mounting = self._levelled(topic, cloud.frame, self._mounting(topic, cloud.frame))
             directions = directions_in(self._some_clouds(topic, cloud.frame), mounting)
             self._mountings[topic, cloud.frame] = mounting._replace(directions=directions)
-        return cloud.scan(self._mountings[topic, cloud.frame], band)
+        return scan_of_cloud(cloud, self._mountings[topic, cloud.frame], band)
 
-    def _cloud(self, message: BagMessage) -> CloudMessage:
+    def _cloud(self, message: BagMessage) -> PointCloud:
         topic = message.topic
         if topic not in self._calibrations:
             info = calibration_beside(topic, self._robot.topics) if topic.type == IMAGE else None
@@ -112,6 +113,6 @@ class BagScans:
         return mounting._replace(rotation=found @ mounting.rotation)
 
     def _some_clouds(self, topic: Topic, frame: str) -> Iterator[PointCloud]:
-        step = max(1, min(topic.message_count, _CLOUDS_TRIED) // _CLOUDS_FOR_FLOOR)
+        step = max(1, min(topic.message_count, _CLOUDS_TRIED) // FIRST_MESSAGES)
         clouds = valid(islice(self._robot.bag.read([topic]), 0, _CLOUDS_TRIED, step), self._cloud)
-        return (found.cloud for found in clouds if found.frame == frame)
+        return (cloud for cloud in clouds if cloud.frame == frame)

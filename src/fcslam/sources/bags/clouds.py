@@ -1,24 +1,17 @@
 """Point clouds and depth images of a bag or a live robot as scans; invalid messages raise ValueError."""
 
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
 from fcslam.records import FloatArray, Transform
 from fcslam.sources.bags.camera import Calibration
 from fcslam.sources.bags.codec import IMAGE, POINT_CLOUD
-from fcslam.sources.bags.messages import ScanMessage, header_of
+from fcslam.sources.bags.messages import LONGEST_SWEEP_S, header_of
 from fcslam.sources.bags.options import GivenPose
 from fcslam.sources.bags.transforms import in_space, planar, rotated
 from fcslam.sources.images import MAX_SIDE_PX
-from fcslam.sources.point_clouds import (
-    FARTHEST_M,
-    CloudBand,
-    CloudMounting,
-    PointCloud,
-    depth_points,
-    scan_of_cloud,
-)
+from fcslam.sources.point_clouds import CloudMounting, PointCloud, depth_points
 
 MOST_POINTS: Final = 4_000_000
 """In one message; the largest scanners measure a tenth of it in a turn."""
@@ -26,32 +19,14 @@ _TYPES: Final = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 """Of the values of sensor_msgs/PointField, by their number."""
 _TIMES: Final = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "timeoffset", "ts")
 _UNITS_S: Final = (1.0, 1e-3, 1e-6, 1e-9)
-_SHORTEST_CLOUD_S, _LONGEST_CLOUD_S = 5e-3, 1.0
-"""Time between the first and the last point of a cloud; it shows the unit of the times."""
+_SHORTEST_CLOUD_S: Final = 5e-3
+"""Least time between the first and the last point of a cloud; it shows the unit of the times."""
 _NEAR_STAMP_S: Final = 1.5
 """Times that begin this near to the stamp, or to 0, are by its clock, or after it."""
 _DEPTHS: Final = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
 """Type and unit of the pixels of a depth image, by its encoding."""
 _OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation of the optical frame of a camera that looks along x (REP 103)."""
-
-
-class CloudMessage(NamedTuple):
-    """The points of a message."""
-
-    stamp: float
-    frame: str
-    cloud: PointCloud
-
-    def scan(self, mounting: CloudMounting, band: CloudBand) -> ScanMessage:
-        """The scan in the level frame of the sensor."""
-        found = scan_of_cloud(self.cloud, mounting, band)
-        scan = ScanMessage(
-            self.stamp + found.offset_s, self.frame, found.beams, 0.0, FARTHEST_M, found.ranges_m, sweep=found.sweep
-        )
-        if found.is_turn or found.sweep is None:
-            return scan
-        return scan._replace(ranges_at_stamp=lambda motion: scan_of_cloud(self.cloud, mounting, band, motion).ranges_m)
 
 
 def cloud_mounting(T_base_sensor: Transform) -> CloudMounting:
@@ -70,11 +45,11 @@ def given_cloud_mounting(pose: GivenPose, frame: str) -> CloudMounting:
     return mounting._replace(rotation=mounting.rotation @ turn @ axes, is_height_known=False)
 
 
-def cloud_of(content: Any, kind: str, bag_time_ns: int, calibration: Calibration | None = None) -> CloudMessage:
+def cloud_of(content: Any, kind: str, bag_time_ns: int, calibration: Calibration | None = None) -> PointCloud:
     """Convert a message of type ``kind``: a point cloud, or a depth image with its calibration."""
     stamp, frame = header_of(content.header, bag_time_ns)
     if kind == IMAGE:
-        return CloudMessage(stamp, frame, PointCloud(_depth_points(content, calibration), np.empty(0)))
+        return PointCloud(stamp, frame, _depth_points(content, calibration), np.empty(0))
     if kind == POINT_CLOUD:
         points, times = _fields(content)
     else:
@@ -82,7 +57,7 @@ def cloud_of(content: Any, kind: str, bag_time_ns: int, calibration: Calibration
         times = np.array([each.offset_time for each in content.points], np.int64)
     measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
     times_s: FloatArray = np.empty(0) if times is None else _seconds(times[measured], stamp)
-    return CloudMessage(stamp, frame, PointCloud(points[measured], times_s))
+    return PointCloud(stamp, frame, points[measured], times_s)
 
 
 def _fields(content: Any) -> tuple[FloatArray, Any]:
@@ -134,7 +109,7 @@ def _seconds(times: Any, stamp: float) -> FloatArray:
     first = times.min()
     after = (times - first).astype(np.float64)
     for unit_s in _UNITS_S:
-        if _SHORTEST_CLOUD_S <= float(after.max()) * unit_s <= _LONGEST_CLOUD_S:
+        if _SHORTEST_CLOUD_S <= float(after.max()) * unit_s <= LONGEST_SWEEP_S:
             break
     else:
         return np.empty(0)

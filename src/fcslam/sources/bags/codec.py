@@ -74,6 +74,10 @@ class MessageCodec:
         zeros = {field: self._zero(*of) for field, of in defined if field not in fields}
         return self.store.types[name](**zeros, **fields)
 
+    def type_of(self, kind: str) -> Any:
+        """The class of messages of this kind, with the constants of its definition."""
+        return self.store.types[full_name(kind)]
+
     def _zero(self, node: "Nodetype", of: Any) -> Any:
         from rosbags.interfaces import Nodetype
 

@@ -7,6 +7,7 @@ from fcslam.records import GnssFix
 from fcslam.sources.bags.codec import FIX
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import header_of
+from fcslam.sources.bags.rig import FARTHEST_SENSOR_M
 from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, mounting
 from fcslam.sources.faults import Fault
@@ -16,11 +17,9 @@ SIGMA_M: Final = {0: 5.0, 1: 2.0, 2: 0.5}
 stations."""
 FIX_INTERVAL_S: Final = 0.9
 """Least time between two fixes that are used; the errors of nearer ones are the same."""
-FARTHEST_ANTENNA_M: Final = 50.0
 HIGHEST_M: Final = 1e5
 """A larger altitude is unknown."""
 LARGEST_SIGMA_M: Final = 1e4
-_NO_FIX: Final = -1
 
 
 def fix_topics(robot: BagRobot) -> list[Topic]:
@@ -34,7 +33,7 @@ def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str)
 
     Latitude and longitude 0 are a fault: the receiver has no fix, and does not say so.
     """
-    if content.status.status <= _NO_FIX:
+    if content.status.status < 0:  # STATUS_NO_FIX
         return None
     latitude, longitude, altitude = float(content.latitude), float(content.longitude), float(content.altitude)
     if latitude == 0.0 == longitude:
@@ -44,7 +43,7 @@ def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str)
     stamp, frame = header_of(content.header, bag_time_ns)
     east2, north2 = float(content.position_covariance[0]), float(content.position_covariance[4])
     sigma_m = SIGMA_M.get(int(content.status.status), SIGMA_M[0])
-    if content.position_covariance_type and 0.0 < east2 < 1e8 and 0.0 < north2 < 1e8:
+    if content.position_covariance_type and 0.0 < east2 < LARGEST_SIGMA_M**2 and 0.0 < north2 < LARGEST_SIGMA_M**2:
         sigma_m = min((0.5 * (east2 + north2)) ** 0.5, LARGEST_SIGMA_M)
     return GnssFix(
         stamp,
@@ -62,6 +61,6 @@ def _antenna(tree: TransformTree, base_frame: str, frame: str) -> tuple[float, f
         x, y, _ = mounting(tree.fixed(base_frame, frame)).T_base_laser
     except NoTransformError:
         return 0.0, 0.0
-    if not math.hypot(x, y) <= FARTHEST_ANTENNA_M:
+    if not math.hypot(x, y) <= FARTHEST_SENSOR_M:
         raise ValueError(f"the antenna is {math.hypot(x, y):g} m from the robot")
     return x, y

@@ -10,19 +10,18 @@ from fcslam.geometry.beams import FULL_TURN_RAD, SAME_VIEW_BEAMS, is_field_of_vi
 from fcslam.records import Beams, Ranges, Sweep, Transform
 from fcslam.sources.bags.codec import NANOSECONDS
 from fcslam.sources.bags.transforms import planar, transform_of
-from fcslam.sources.pose import Pose
+from fcslam.sources.pose import LARGEST_COORDINATE, Pose
 
 UNKNOWN_RANGE_M = 1000.0
 """Taken as the maximum of a laser that states none: 0, below 0 or not a number; and of one that states more."""
-SHORTEST_SWEEP_S, _LONGEST_SWEEP_S = 1e-4, 1.0
-"""A scan that takes less is one at once; one that takes more is of no 2D LiDAR, so its time increment is wrong."""
+SHORTEST_SWEEP_S, LONGEST_SWEEP_S = 1e-4, 1.0
+"""A scan that takes less is one at once; no scanner takes longer for a turn, so a larger time increment is wrong."""
 _OVER_SCAN_TIME = 1.2
 """Largest ratio of the time of all beams to the time between scans; some drivers state a wrong time increment."""
 _COUNT_TOLERANCE = 0.01
 """Share of the ranges by which drivers that round the increment are wrong."""
-_MAX_COORDINATE_M = 1e7
-_LONGEST_FRAME = 255
-"""Characters in the name of a frame, as in that of a topic."""
+LONGEST_NAME = 255
+"""Characters in the name of a topic or a frame, as in ROS 2."""
 
 
 class BeamsError(ValueError):
@@ -96,7 +95,7 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
 def _sweep(count: int, increment_s: float, scan_time_s: float) -> Sweep | None:
     """Times of the beams of a message: the stamp is the time of the first, as ``LaserScan.msg`` says."""
     last_s = (count - 1) * increment_s
-    if not SHORTEST_SWEEP_S <= last_s <= _LONGEST_SWEEP_S:  # false for NaN
+    if not SHORTEST_SWEEP_S <= last_s <= LONGEST_SWEEP_S:  # false for NaN
         return None
     if scan_time_s > 0.0 and count * increment_s > _OVER_SCAN_TIME * scan_time_s:
         last_s = scan_time_s * (count - 1) / count
@@ -177,13 +176,13 @@ def header_of(header: Any, bag_time_ns: int) -> tuple[float, str]:
 
 def frame_of(name: str) -> str:
     """Frame name without the leading slash of ROS 1."""
-    if len(name) > _LONGEST_FRAME:
+    if len(name) > LONGEST_NAME:
         raise ValueError("the name of a frame is too long")
     return name.lstrip("/")
 
 
 def _transform(translation: Any, rotation: Any) -> Transform:
     x, y, z = translation.x, translation.y, translation.z
-    if not all(abs(value) < _MAX_COORDINATE_M for value in (x, y, z)):  # false for NaN
+    if not all(abs(value) < LARGEST_COORDINATE for value in (x, y, z)):  # false for NaN
         raise ValueError(f"the position {x:g}, {y:g}, {z:g} cannot be that of a robot")
     return transform_of((x, y, z), (rotation.x, rotation.y, rotation.z, rotation.w))

@@ -30,12 +30,10 @@ MAX_GAP_S = 1.0
 
 _AHEAD_S = 0.2
 """An image that is farther ahead of the newest reading than this holds no scan; by one clock, odometry is not later."""
-_READINGS_KEPT = 1000
-"""Number of past readings that are searched for a scan."""
 _LATE_S, _MOST_LATE = 0.15, 3
 """A reading may be recorded so long after one with a later stamp, and so many in a row, as over a network."""
 _LONGEST_QUEUE = 1000
-"""Most waiting scans and readings; beyond, the oldest scan does not wait for later odometry."""
+"""Most past readings that are searched for a scan, and most waiting items; beyond, the oldest one waits no longer."""
 
 
 class PosedScan(NamedTuple):
@@ -74,7 +72,7 @@ class OdometryPairing:
     """Pairs items as they come; each waits until the odometry at its stamp is known."""
 
     def __init__(self) -> None:
-        self._readings: deque[OdometryReading] = deque(maxlen=_READINGS_KEPT)
+        self._readings: deque[OdometryReading] = deque(maxlen=_LONGEST_QUEUE)
         self._queue: deque[_QueuedItem] = deque()
         self._updates = OdometryUpdates()
         self._late = 0

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, islice
 from math import degrees, tau
-from pathlib import Path
 from statistics import quantiles
 from typing import NamedTuple
 
@@ -13,59 +12,27 @@ from fcslam.records import Sweep
 from fcslam.sources.bags.camera import Calibration, image_of
 from fcslam.sources.bags.census import BagMessage
 from fcslam.sources.bags.cloud_scans import BagScans, calibration_in, valid
-from fcslam.sources.bags.codec import LASER_SCANS, ODOMETRY, SCANS
+from fcslam.sources.bags.codec import LASER_SCANS, ODOMETRY
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.messages import OdometryReading, ScanMessage, odometry_in
+from fcslam.sources.bags.messages import OdometryReading, odometry_in
 from fcslam.sources.bags.options import NO_ODOMETRY, BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Message
-from fcslam.sources.bags.rig import usual_scan
+from fcslam.sources.bags.rig import RecordedLaser, usual_scan
 from fcslam.sources.bags.robots import BagRobot, listed, usual
 from fcslam.sources.bags.sectors import are_sectors, cloud_sector_rad, joined_turns
 from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree
 from fcslam.sources.contradictions import CHANGED, changed_share
-from fcslam.sources.gate import SCANS_THAT_VOTE
+from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
 from fcslam.sources.point_clouds import CloudBand
 
 _IMAGES_TRIED = 5
 _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
-_READINGS_TRIED = 20
 _FEWEST_LAGS = 4
 _LARGEST_DELAY_S = 2.0
 """Messages of one clock are recorded within this time of each other's delay."""
-
-
-class RecordedLaser(NamedTuple):
-    """One laser of a bag, by its first scans."""
-
-    topic: Topic
-    first: ScanMessage
-    """The first scan with its usual beams."""
-    frame: str | None = None
-    """Frame of its scans, on a topic with several; None: any."""
-    is_in_sectors: bool = False
-
-    @property
-    def name(self) -> str:
-        """The topic, and the frame if it has several."""
-        return self.topic.name if self.frame is None else f"{self.topic.name} in '{self.frame}'"
-
-    def notes(self, path: Path, band: CloudBand) -> Iterator[str]:
-        """How its messages become scans, if they are none."""
-        if self.is_in_sectors:
-            yield f"{path}: the scans of {self.name} are sectors of a turn, those of each turn are joined"
-        if self.topic.type not in LASER_SCANS:
-            yield (
-                f"{path}: the scans of {self.name} are its nearest points from {band.low_m:g} m to {band.high_m:g} m "
-                "above the floor (--sensors cloud-band chooses)"
-            )
-        if self.topic.type in SCANS and self.topic.type not in LASER_SCANS and self.first.sweep is None:
-            yield (
-                f"{path}: the points of {self.name} have no times, or all the same, so the motion of the robot during "
-                "a cloud is corrected only if the drive shows how the sensor turns; let the driver publish them"
-            )
 
 
 class OdometryInput(NamedTuple):
@@ -166,7 +133,7 @@ class _Planner:
 
     def _laser(self, topic: Topic, frame: str | None) -> RecordedLaser:
         own = (scan for scan in self._scans.of(topic) if frame in (None, scan.frame))
-        first = list(islice(own, SCANS_THAT_VOTE))
+        first = list(islice(own, FIRST_MESSAGES))
         if not first:
             raise SourceError(
                 f"{self._path}: none of the {topic.message_count} scans in {topic.name} can be read"
@@ -179,7 +146,7 @@ class _Planner:
                 "driver publish whole turns, or record its laser scans"
             )
         is_in_sectors = are_sectors(first)
-        return RecordedLaser(topic, usual_scan(joined_turns(first) if is_in_sectors else first), frame, is_in_sectors)
+        return RecordedLaser(topic, usual_scan(joined_turns(first) if is_in_sectors else first), is_in_sectors, frame)
 
     def _first_error(self, topic: Topic) -> str:
         for message in islice(self._bag.read([topic]), 1):
@@ -271,7 +238,7 @@ class _Planner:
         """Usual time from the measurement to the recording of a message; None if it varies, or there are too few."""
         lags_s = [
             message.bag_time_ns / 1e9 - end_s
-            for message in islice(self._bag.read(topics), _READINGS_TRIED)
+            for message in islice(self._bag.read(topics), FIRST_MESSAGES)
             for end_s in chain.from_iterable(valid([message], ends_of))
         ]
         if len(lags_s) < _FEWEST_LAGS:
@@ -293,6 +260,6 @@ class _Planner:
         return 0.0 if scan is None else scan.beams.span_rad
 
     def _odometry_error(self, topic: Topic) -> str:
-        first = [message.decoded for message in islice(self._bag.read([topic]), _READINGS_TRIED)]
+        first = [message.decoded for message in islice(self._bag.read([topic]), FIRST_MESSAGES)]
         is_bad = topic.type == ODOMETRY and first and all(isinstance(each, ValueError) for each in first)
         return str(first[0]) if is_bad else ""

@@ -7,12 +7,11 @@ ends; a live robot asks which lasers are silent, and does not wait for them, or 
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
 
-from fcslam.records import Beams
 from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import ScanMessage
 from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedImage, PosedScan
+from fcslam.sources.bags.rig import RecordedLaser
 from fcslam.sources.bags.sectors import SectorJoiner
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import ScanGate
@@ -23,13 +22,6 @@ _LONGEST_QUEUE = 20
 
 Numbered = tuple[int, Entry]
 """An entry with the number of its message."""
-
-
-class ReadLaser(NamedTuple):
-    """How the messages of a laser are read."""
-
-    beams: Beams
-    is_in_sectors: bool
 
 
 class ScanMerger:
@@ -78,12 +70,12 @@ class ScanMerger:
 class SensorReader:
     """Turns scans, odometry and images into consistent entries with poses."""
 
-    def __init__(self, lasers: Sequence[ReadLaser], has_odometry: bool, audit: Audit) -> None:
+    def __init__(self, lasers: Sequence[RecordedLaser], has_odometry: bool, audit: Audit) -> None:
         """``audit`` counts the faults."""
         self._joiners = {number: SectorJoiner() for number, laser in enumerate(lasers) if laser.is_in_sectors}
         self._merger = ScanMerger(len(lasers))
         self._pairing = OdometryPairing() if has_odometry else None
-        self._gates, self._audit = [ScanGate(laser.beams, audit) for laser in lasers], audit
+        self._gates, self._audit = [ScanGate(laser.first.beams, audit) for laser in lasers], audit
         self._number = 0
 
     def add(self, number: int, item: Message) -> Iterator[Numbered]:

@@ -23,7 +23,7 @@ _KEPT_BYTES = 8_000_000
 """Unpacked chunks that are kept while messages of several chunks are read in turn."""
 _REREAD_RATIO = 10 * MOST_STREAM_RATIO
 """Bytes of a file to which messages in an odd order may unpack chunks again and again, as a multiple of its size."""
-_HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x01, 0x03, 0x04, 0x05, 0x06, 0x0F
+_HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = b"\x01", b"\x03", b"\x04", b"\x05", b"\x06", b"\x0f"
 _ROS1_MESSAGE, _ROS1_CHUNK, _ROS1_CONNECTION = b"\x02", b"\x05", b"\x07"
 _ROS1_MAGIC_BYTES = len(b"#ROSBAG V2.0\n")
 _SQLITE_HEADER_BYTES = 100
@@ -122,10 +122,10 @@ class RecordFile:
 
     def _mcap_records(self, file: BinaryIO, chunk: int) -> Iterator[StoredMessage]:
         while head := file.read(9):
-            opcode, size = struct.unpack("<BQ", head)
+            opcode, size = struct.unpack("<cQ", head)
             if opcode == _DATA_END:
                 return
-            if opcode == 0:
+            if opcode == b"\0":
                 raise DamageError
             start, content = file.tell(), _read(file, size)
             is_cut = len(content) < size

@@ -1,40 +1,66 @@
 """The mounted sensors of a robot: they turn its messages into records."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import degrees, hypot, radians
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from fcslam.errors import FcslamError
+from fcslam.errors import InputError
 from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, frozen
 from fcslam.sources.bags.camera import Calibration
-from fcslam.sources.bags.codec import LASER_SCANS
+from fcslam.sources.bags.codec import LASER_SCANS, SCANS
+from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, ScanMessage, measured_ranges, reversed_sweep
 from fcslam.sources.bags.options import GivenPose
 from fcslam.sources.bags.pairing import PosedImage, PosedScan
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
 from fcslam.sources.gate import usual_beams
 from fcslam.sources.images import check_image
+from fcslam.sources.point_clouds import CloudBand
 
 _LEVEL_RAD = radians(2.0)
 _STEEPEST_RAD = radians(10.0)
-_FARTHEST_M = 10.0
+FARTHEST_SENSOR_M = 10.0
 """Largest distance of a sensor from the base of a robot; a pose in millimetres or centimetres says more."""
 
 
-class MountingError(FcslamError):
-    """A laser cannot be read as it is mounted; the message says why, and what to do."""
+class RecordedLaser(NamedTuple):
+    """A laser or a sensor of clouds, by its first scans."""
 
+    topic: Topic
+    first: ScanMessage
+    """The first scan with its usual beams."""
+    is_in_sectors: bool
+    frame: str | None = None
+    """Frame of its scans, on a topic with several; None: any."""
 
-class MountedSensor(NamedTuple):
-    """A laser or a sensor of clouds on its robot."""
+    @property
+    def name(self) -> str:
+        """The topic, and the frame if it has several."""
+        return self.topic.name if self.frame is None else f"{self.topic.name} in '{self.frame}'"
 
-    name: str
-    topic: str
-    kind: str
-    frame: str
+    @property
+    def is_level(self) -> bool:
+        """Whether its scans are level however it is mounted, as they are made of points."""
+        return self.topic.type not in LASER_SCANS
+
+    def notes(self, path: Path, band: CloudBand) -> Iterator[str]:
+        """How its messages become scans, if they are none."""
+        if self.is_in_sectors:
+            yield f"{path}: the scans of {self.name} are sectors of a turn, those of each turn are joined"
+        if self.is_level:
+            yield (
+                f"{path}: the scans of {self.name} are its nearest points from {band.low_m:g} m to {band.high_m:g} m "
+                "above the floor (--sensors cloud-band chooses)"
+            )
+        if self.is_level and self.topic.type in SCANS and self.first.sweep is None:
+            yield (
+                f"{path}: the points of {self.name} have no times, or all the same, so the motion of the robot during "
+                "a cloud is corrected only if the drive shows how the sensor turns; let the driver publish them"
+            )
 
 
 class Rig(NamedTuple):
@@ -80,54 +106,60 @@ def usual_scan(scans: Sequence[ScanMessage]) -> ScanMessage:
 
 
 def rig_of(
-    first: Sequence[ScanMessage],
+    recorded: Sequence[RecordedLaser],
     ranges_max_m: Sequence[float],
     mountings: Sequence[Mounting],
     camera: CameraModel | None,
 ) -> Rig:
-    """The rig whose lasers have the beams of these scans, and these largest ranges and mountings."""
+    """The rig of these lasers with these largest ranges and mountings."""
     lasers = tuple(
-        LaserModel(*_turned_beams(scan.beams, mounted.upside_down), range_max_m, mounted.T_base_laser)
-        for scan, range_max_m, mounted in zip(first, ranges_max_m, mountings, strict=True)
+        LaserModel(*_turned_beams(laser.first.beams, mounted.upside_down), range_max_m, mounted.T_base_laser)
+        for laser, range_max_m, mounted in zip(recorded, ranges_max_m, mountings, strict=True)
     )
     return Rig(lasers, tuple(mounted.upside_down for mounted in mountings), camera)
 
 
 def mountings_of(
-    sensors: Sequence[MountedSensor], tree: TransformTree, base_frame: str, poses: Sequence[GivenPose]
+    lasers: Sequence[RecordedLaser], tree: TransformTree, base_frame: str, poses: Sequence[GivenPose]
 ) -> list[Mounting]:
-    """Where the sensors sit: where the user says, or else where tf says."""
+    """Where the lasers sit: where the user says, or else where tf says.
+
+    Raises:
+        NoTransformError: tf does not say it, yet.
+        InputError: a laser cannot be read as it is mounted.
+    """
     if poses:
         return [
-            Mounting((x, y, theta), upside_down=any(upside_down) and sensor.kind in LASER_SCANS, tilt_rad=0.0)
-            for (x, y, theta, *upside_down), sensor in zip(poses, sensors, strict=True)
+            Mounting((x, y, theta), upside_down=any(upside_down) and not laser.is_level, tilt_rad=0.0)
+            for (x, y, theta, *upside_down), laser in zip(poses, lasers, strict=True)
         ]
     topic_of: dict[str, str] = {}
-    for sensor in sensors:
-        if (other := topic_of.setdefault(sensor.frame, sensor.topic)) != sensor.topic:
-            raise MountingError(
-                f"the scans of {other} and {sensor.topic} have one frame, '{sensor.frame}', so tf cannot give the pose "
-                "of each laser; give it with --sensors laser-pose=X,Y,THETA for each"
+    for laser in lasers:
+        name, frame = laser.topic.name, laser.first.frame
+        if (other := topic_of.setdefault(frame, name)) != name:
+            raise InputError(
+                f"the scans of {other} and {name} have one frame, '{frame}', so tf cannot give the pose of each laser; "
+                "give it with --sensors laser-pose=X,Y,THETA for each"
             )
-    return [_mounting_in(tree, base_frame, sensor) for sensor in sensors]
+    return [_mounting_in(tree, base_frame, laser) for laser in lasers]
 
 
-def _mounting_in(tree: TransformTree, base_frame: str, sensor: MountedSensor) -> Mounting:
+def _mounting_in(tree: TransformTree, base_frame: str, laser: RecordedLaser) -> Mounting:
     try:
-        mounted = mounting(tree.fixed(base_frame, sensor.frame))
+        mounted = mounting(tree.fixed(base_frame, laser.first.frame))
     except NoTransformError as error:
-        raise NoTransformError(f"{error}, so the pose of the laser of {sensor.name} is unknown") from error
+        raise NoTransformError(f"{error}, so the pose of the laser of {laser.name} is unknown") from error
     away_m = hypot(*mounted.T_base_laser[:2])
-    if away_m > _FARTHEST_M:
-        raise MountingError(
-            f"tf puts the laser of {sensor.name} {away_m:.0f} m from '{base_frame}', as if in millimetres or "
+    if away_m > FARTHEST_SENSOR_M:
+        raise InputError(
+            f"tf puts the laser of {laser.name} {away_m:.0f} m from '{base_frame}', as if in millimetres or "
             "centimetres; correct it in tf, or give its pose with --sensors laser-pose=X,Y,THETA (metres, radians)"
         )
-    if sensor.kind not in LASER_SCANS:  # their scans are level
+    if laser.is_level:
         return Mounting(mounted.T_base_laser, upside_down=False, tilt_rad=0.0)
     if mounted.tilt_rad > _STEEPEST_RAD:
-        raise MountingError(
-            f"the laser of {sensor.name} is tilted by {degrees(mounted.tilt_rad):.0f} degrees and does not look along "
+        raise InputError(
+            f"the laser of {laser.name} is tilted by {degrees(mounted.tilt_rad):.0f} degrees and does not look along "
             "the floor; choose a level one by --sensors scan-topic, or give its pose with --sensors laser-pose"
         )
     return mounted

@@ -12,26 +12,17 @@ from itertools import chain, repeat
 from pathlib import Path
 from typing import NamedTuple
 
-from fcslam.errors import SourceError
+from fcslam.errors import InputError, SourceError
 from fcslam.geometry import se2
 from fcslam.records import GnssFix, Odometry, SensorRecord, frozen
 from fcslam.sources.bags.census import DecodedBag
-from fcslam.sources.bags.codec import LASER_SCANS
 from fcslam.sources.bags.fixes import FIX_INTERVAL_S, fix_of, fix_topics
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, BeamsError, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
 from fcslam.sources.bags.plan import BagPlan, plan_of
-from fcslam.sources.bags.reader import Numbered, ReadLaser, SensorReader
-from fcslam.sources.bags.rig import (
-    MountedSensor,
-    MountingError,
-    Rig,
-    mounted_camera,
-    mountings_of,
-    rig_of,
-    tilt_note,
-)
+from fcslam.sources.bags.reader import Numbered, SensorReader
+from fcslam.sources.bags.rig import Rig, mounted_camera, mountings_of, rig_of, tilt_note
 from fcslam.sources.bags.robots import BagRobot, robot_of, robots_of, slashed
 from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformError
 from fcslam.sources.contradictions import ScanWatch
@@ -164,8 +155,7 @@ class RosBag:
         self, audit: Audit, band: CloudBand, errors: dict[str, str] | None = None, with_images: bool = False
     ) -> Iterator[Numbered]:
         plan, errors = self.plan, {} if errors is None else errors
-        lasers = [ReadLaser(laser.first.beams, laser.is_in_sectors) for laser in plan.lasers]
-        reader = SensorReader(lasers, plan.odometry is not None, audit)
+        reader = SensorReader(plan.lasers, plan.odometry is not None, audit)
         for message in self.bag.read(plan.read_topics(with_images)):
             try:
                 items = plan.items(message, band, self._options.correction)
@@ -203,7 +193,7 @@ class RosBag:
             if isinstance(entry, PosedScan):
                 laser = entry.scan.laser
                 farthest_m[laser] = max(farthest_m[laser], entry.scan.range_max_m)
-                if lasers[laser].topic.type not in LASER_SCANS:
+                if lasers[laser].is_level:
                     bodies[laser].add(entry.T_odom_base, entry.scan.beams, entry.scan.raw_ranges_m)
                 if (sample := samples[laser]).wants(entry.T_odom_base):
                     scan = entry.scan
@@ -215,7 +205,7 @@ class RosBag:
         self._refuse(audit.faults(), scans, odometry, errors)
         which = [f" of {laser.name}" for laser in lasers]
         for sample, its, recorded in zip(samples, which, lasers, strict=True):
-            sample.check(self.path, its, _OF_SCANS if recorded.topic.type in LASER_SCANS else _OF_CLOUDS)
+            sample.check(self.path, its, _OF_CLOUDS if recorded.is_level else _OF_SCANS)
         placeholders = tuple(sample.placeholders() for sample in samples)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
         mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(base_frame, errors)]
@@ -251,7 +241,7 @@ class RosBag:
         ]
         if plan.topics.camera is not None and camera_note:
             notes.append(f"{self.path}: the camera of {plan.topics.camera.name} {camera_note}")
-        rig = rig_of([laser.first for laser in lasers], farthest_m, mountings, camera)
+        rig = rig_of(lasers, farthest_m, mountings, camera)
         survey = Survey(
             scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), (*self._notes, *notes), camera
         )
@@ -276,10 +266,9 @@ class RosBag:
         if poses and len(poses) != len(lasers):
             named = ", ".join(laser.name for laser in lasers)
             raise SourceError(f"{self.path}: {len(poses)} laser-pose for the lasers {named}; {_EACH_LASER}")
-        sensors = [MountedSensor(each.name, each.topic.name, each.topic.type, each.first.frame) for each in lasers]
         try:
-            return mountings_of(sensors, self.plan.tree, base_frame, poses)
-        except MountingError as error:
+            return mountings_of(lasers, self.plan.tree, base_frame, poses)
+        except InputError as error:
             raise SourceError(f"{self.path}: {error}") from error
         except NoTransformError as error:
             raise SourceError(

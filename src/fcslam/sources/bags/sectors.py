@@ -9,13 +9,12 @@ import numpy as np
 
 from fcslam.geometry.beams import ROUNDING, SAME_VIEW_BEAMS
 from fcslam.records import Beams, Sweep
-from fcslam.sources.bags.messages import SHORTEST_SWEEP_S, ScanMessage, measured_ranges, reversed_sweep
+from fcslam.sources.bags.messages import LONGEST_SWEEP_S, SHORTEST_SWEEP_S, ScanMessage, measured_ranges, reversed_sweep
 
 NARROWEST_RAD, WIDEST_RAD = 0.01 * tau, 0.75 * tau
 """Field of view of a sector."""
 WIDEST_HALF_RAD: Final = 3.0
 """Sectors of half a turn follow each other in either direction; they are taken to be counter-clockwise."""
-LONGEST_TURN_S: Final = 1.0
 _SLOTS: Final = 36
 """Parts of a turn in which clouds are compared."""
 LEAST_SHARE: Final = 1.0 / 3.0
@@ -34,7 +33,7 @@ def cloud_sector_rad(clouds: Sequence[ScanMessage]) -> float | None:
         measured = np.flatnonzero(np.isfinite(cloud.raw_ranges_m))
         angles = cloud.beams.angle_min_rad + measured * cloud.beams.angle_increment_rad
         seen[k, np.floor(angles / tau * _SLOTS).astype(np.int64) % _SLOTS] = True
-    at_once = [k for k, cloud in enumerate(clouds) if abs(cloud.stamp - clouds[0].stamp) < LONGEST_TURN_S / 2]
+    at_once = [k for k, cloud in enumerate(clouds) if abs(cloud.stamp - clouds[0].stamp) < LONGEST_SWEEP_S / 2]
     own, together = float(np.median(seen.sum(axis=1))), int(seen[at_once].any(axis=0).sum())
     is_apart = together >= max(_SLOTS / 2, 1.5 * own) or together >= max(_SLOTS / 6, 5.0 * own)
     return own / _SLOTS * tau if is_apart else None
@@ -70,7 +69,7 @@ class SectorJoiner:
         begin = self._begin(sector)
         return (
             _is_alike(first, sector)
-            and 0.0 <= sector.stamp - first.stamp < LONGEST_TURN_S
+            and 0.0 <= sector.stamp - first.stamp < LONGEST_SWEEP_S
             and begin > end - SAME_VIEW_BEAMS
             and begin + sector.beams.beam_count < _turn_beams(first.beams) + SAME_VIEW_BEAMS
         )

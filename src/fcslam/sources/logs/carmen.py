@@ -23,13 +23,11 @@ from typing import NamedTuple
 import numpy as np
 
 from fcslam.geometry.beams import is_field_of_view
-from fcslam.records import Beams, Ranges, frozen
-from fcslam.sources.pose import Pose
+from fcslam.records import Beams, LaserModel, Ranges, frozen
+from fcslam.sources.pose import LARGEST_COORDINATE, Pose
 
 SICK_MAX_RANGE_M = 50.0
 """SICK scanners send it, or more, for no return."""
-_MAX_COORDINATE = 1e7
-"""Metres or radians; a larger pose is damage."""
 _LONGEST_RANGE_M = 1e6
 
 _RAW, _SCAN = (
@@ -44,14 +42,6 @@ _KNOWN = re.compile(
 )
 
 
-class StatedLaser(NamedTuple):
-    """Laser geometry that a scan line states; radians and metres."""
-
-    angle_min_rad: float
-    angle_increment_rad: float
-    max_range_m: float
-
-
 class ScanLine(NamedTuple):
     """One scan."""
 
@@ -61,7 +51,8 @@ class ScanLine(NamedTuple):
     T_odom_laser: Pose
     ranges_m: Ranges
     """Those that are negative, not finite or too large are NaN."""
-    stated: StatedLaser | None = None
+    stated: LaserModel | None = None
+    """The laser that the line states, without its mounting."""
     is_timed: bool = True
     """False once a stamp stands where the log states none."""
 
@@ -73,14 +64,7 @@ class OdometryLine(NamedTuple):
     T_odom_base: Pose
 
 
-class ParameterLine(NamedTuple):
-    """A setting of the robot that made the log."""
-
-    name: str
-    value: str
-
-
-Line = ScanLine | OdometryLine | ParameterLine
+Line = ScanLine | OdometryLine
 
 
 def is_carmen(head: bytes) -> bool:
@@ -94,17 +78,18 @@ def is_raw(head: bytes) -> bool:
 
 
 class CarmenParser:
-    """Parses the lines of one pass over a log; holds the latest odometry."""
+    """Parses the lines of one pass over a log; holds the latest odometry and the settings of the robot."""
 
     def __init__(self, raw: bool) -> None:
         """``raw``: scans are RAWLASER1 only."""
+        self.parameters: dict[str, str] = {}
         self._T_odom_base: Pose | None = None
-        self._parsers: dict[bytes, Callable[[bytes], Line]] = {
+        self._parsers: dict[bytes, Callable[[bytes], Line | None]] = {
             **(
                 {b"RAWLASER1": self._rawlaser} if raw else {b"FLASER": _parse_flaser, b"ROBOTLASER1": _parse_robotlaser}
             ),
             b"ODOM": self._odometry,
-            b"PARAM": _parse_parameter,
+            b"PARAM": self._parameter,
         }
 
     def __call__(self, line: bytes) -> Line | None:
@@ -129,6 +114,10 @@ class CarmenParser:
         self._T_odom_base = _pose_of(words[1:4])
         return OdometryLine(_stamp_of(words[7]) if len(words) >= 10 else nan, self._T_odom_base)
 
+    def _parameter(self, line: bytes) -> None:
+        _, name, value, *_ = line.decode("ascii", errors="replace").split()
+        self.parameters[name] = value
+
 
 def _parse_flaser(line: bytes) -> ScanLine:
     front, *tail = line.rsplit(None, 9)
@@ -147,7 +136,7 @@ def _parse_robotlaser(line: bytes) -> ScanLine:
     return ScanLine(_stamp_of(tail[11]), _pose_of(tail[3:6]), _pose_of(tail[:3]), *measured)
 
 
-def _measured(front: bytes) -> tuple[Ranges, StatedLaser]:
+def _measured(front: bytes) -> tuple[Ranges, LaserModel]:
     """Ranges and laser in a line up to its remissions."""
     _, kind, start, fov, resolution, max_range, _, _, count, *words = front.split()
     beam_count = int(count)
@@ -167,7 +156,7 @@ def _ranges_of(words: list[bytes], beam_count: int) -> Ranges:
     return frozen(values, np.float32)
 
 
-def _stated_laser(kind: int, numbers: list[float], beam_count: int) -> StatedLaser:
+def _stated_laser(kind: int, numbers: list[float], beam_count: int) -> LaserModel:
     start_rad, fov_rad, resolution_rad, max_range_m = numbers
     increment_rad = resolution_rad if resolution_rad > 0.0 else fov_rad / (beam_count - 1)
     if not (increment_rad > 0.0 and is_field_of_view(Beams(beam_count, start_rad, increment_rad))):
@@ -176,18 +165,13 @@ def _stated_laser(kind: int, numbers: list[float], beam_count: int) -> StatedLas
         max_range_m = SICK_MAX_RANGE_M
     if kind in SICK_TYPES:
         max_range_m = min(max_range_m, SICK_MAX_RANGE_M)
-    return StatedLaser(start_rad, increment_rad, max_range_m)
-
-
-def _parse_parameter(line: bytes) -> ParameterLine:
-    _, name, value, *_ = line.decode("ascii", errors="replace").split()
-    return ParameterLine(name, value)
+    return LaserModel(beam_count, start_rad, increment_rad, max_range_m)
 
 
 def _pose_of(tokens: list[bytes]) -> Pose:
     """Raises ValueError for an implausible pose."""
     x, y, theta = map(float, tokens)
-    limit = _MAX_COORDINATE
+    limit = LARGEST_COORDINATE
     if not (-limit < x < limit and -limit < y < limit and -limit < theta < limit):
         raise ValueError("no sane pose")
     return x, y, theta

@@ -17,11 +17,12 @@ their resolution, and logs do not say which; beyond 50 m indoors nothing is lost
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import degrees, isfinite, radians
 
 from fcslam.records import Beams, LaserModel
 from fcslam.sources.gate import TOLERATED_SHARE, usual_beams
-from fcslam.sources.logs.carmen import SICK_MAX_RANGE_M, ScanLine, StatedLaser
+from fcslam.sources.logs.carmen import SICK_MAX_RANGE_M, ScanLine
 from fcslam.sources.pose import Pose, relative_pose
 
 _MOUNTING_TOLERANCE = 0.01
@@ -32,17 +33,17 @@ _RESOLUTION_DEG = {101: 1.0, 201: 0.5, 401: 0.25, 541: 0.5, 1081: 0.25}
 
 def usual_log_beams(scans: Sequence[ScanLine], parameters: Mapping[str, str]) -> Beams:
     """The usual beams of the first scans of a log."""
-    stated = [Beams(len(scan.ranges_m), *scan.stated[:2]) for scan in scans if scan.stated is not None]
+    stated = [scan.stated.beams for scan in scans if scan.stated is not None]
     if stated:
         return usual_beams(stated)
     (count, _), *_ = Counter(len(scan.ranges_m) for scan in scans).most_common(1)
-    return Beams(count, *assumed_laser(count, parameters)[:2])
+    return assumed_laser(count, parameters).beams
 
 
 def beams_of(scan: ScanLine, declared: Beams) -> Beams | None:
     """The beams that the line states, or those of the laser; None if there are more or fewer and no angles."""
     if scan.stated is not None:
-        return Beams(len(scan.ranges_m), scan.stated.angle_min_rad, scan.stated.angle_increment_rad)
+        return scan.stated.beams
     return declared if len(scan.ranges_m) == declared.beam_count else None
 
 
@@ -80,17 +81,17 @@ def laser_model(scan: ScanLine, parameters: Mapping[str, str], mounting: Mountin
     """The laser of ``scan``."""
     T_base_laser = mounting.T_base_laser(_parameter(parameters, "robot_frontlaser_offset") or 0.0)
     stated = scan.stated or assumed_laser(len(scan.ranges_m), parameters)
-    return LaserModel(len(scan.ranges_m), *stated, T_base_laser)
+    return replace(stated, T_base_laser=T_base_laser)
 
 
-def assumed_laser(beam_count: int, parameters: Mapping[str, str] | None = None) -> StatedLaser:
+def assumed_laser(beam_count: int, parameters: Mapping[str, str] | None = None) -> LaserModel:
     """The default geometry of a laser with ``beam_count`` (two or more) beams."""
     middle = beam_count // 2
     resolution_deg = _parameter_resolution_deg(beam_count, parameters or {})
     if resolution_deg is None:
         resolution_deg = _RESOLUTION_DEG.get(beam_count, 90.0 / middle)
     increment_rad = radians(resolution_deg)
-    return StatedLaser(-middle * increment_rad, increment_rad, SICK_MAX_RANGE_M)
+    return LaserModel(beam_count, -middle * increment_rad, increment_rad, SICK_MAX_RANGE_M)
 
 
 def _parameter_resolution_deg(beam_count: int, parameters: Mapping[str, str]) -> float | None:

@@ -21,25 +21,12 @@ from fcslam.errors import SourceError
 from fcslam.records import Beams, FloatArray, LaserScan, Odometry, SensorRecord, frozen
 from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
-from fcslam.sources.gate import SCANS_THAT_VOTE, ScanGate, check_consistency, scan_window
+from fcslam.sources.gate import FIRST_MESSAGES, ScanGate, check_consistency, scan_window
 from fcslam.sources.logs.archive import head, numbered_lines
-from fcslam.sources.logs.carmen import (
-    SICK_MAX_RANGE_M,
-    CarmenParser,
-    Line,
-    OdometryLine,
-    ParameterLine,
-    ScanLine,
-    is_raw,
-)
-from fcslam.sources.logs.laser import (
-    MountingEstimate,
-    beams_of,
-    laser_model,
-    usual_log_beams,
-)
+from fcslam.sources.logs.carmen import SICK_MAX_RANGE_M, CarmenParser, Line, OdometryLine, ScanLine, is_raw
+from fcslam.sources.logs.laser import MountingEstimate, beams_of, laser_model, usual_log_beams
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary, check_units
-from fcslam.sources.pose import UNKNOWN_POSE, Pose
+from fcslam.sources.pose import UNKNOWN_POSE
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
@@ -48,7 +35,7 @@ KEPT_BYTES = 1 << 25
 
 NumberedLine = tuple[int, Line | None]
 """A line with its number, counted from 1; None if it is broken."""
-_WORDS_NAMED, _LONGEST_WORD = 5, 20
+_WORDS_NAMED = 5
 UNTIMED_STEP_S = 1.0
 """Time between the scans of a log that states none."""
 
@@ -61,12 +48,6 @@ class _Reading(NamedTuple):
     placeholders: tuple[float, ...]
 
 
-class _Scan(NamedTuple):
-    line: ScanLine
-    beams: Beams
-    T_odom_base: Pose
-
-
 class TextLog:
     """A log with one message per line, compressed or not."""
 
@@ -77,6 +58,8 @@ class TextLog:
         self._audit = Audit()
         self._kept: list[NumberedLine] = []
         """All lines, once a short log was read to its end and until all its records were."""
+        self._parameters: dict[str, str] = {}
+        """Settings of the robot in the lines that were read."""
 
     @property
     def faults(self) -> Faults:
@@ -89,8 +72,8 @@ class TextLog:
             return self._reading.survey
         audit, track = Audit(), PathSummary()
         for _, entry in self._entries(scans, self._all_lines(), audit):
-            if isinstance(entry, _Scan):
-                track.add(entry.line.stamp, entry.T_odom_base)
+            if isinstance(entry, ScanLine):
+                track.add(entry.stamp, entry.T_odom_base)
         return Survey(track.count, track.duration_s, track.length_m, self._reading.survey.lasers, audit.faults())
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
@@ -104,11 +87,13 @@ class TextLog:
                 if self._reading.has_odometry:
                     yield Odometry(entry.stamp, T_odom_base)
                 continue
-            ranges_m = entry.line.ranges_m
+            ranges_m = entry.ranges_m
             if invalid := int(np.count_nonzero(np.isnan(ranges_m))):
                 audit.add(Fault.INVALID_RANGE, number, invalid)
             ranges_m = without(ranges_m, self._reading.placeholders)
-            scan = LaserScan(entry.line.stamp, ranges_m, laser.with_beams(entry.beams), T_odom_base)
+            beams = beams_of(entry, laser.beams)
+            assert beams is not None  # as the gate says
+            scan = LaserScan(entry.stamp, ranges_m, laser.with_beams(beams), T_odom_base)
             watch.add(number, scan)
             yield scan
         self._kept = []  # whoever maps a recording reads its records once
@@ -116,14 +101,12 @@ class TextLog:
     @cached_property
     def _reading(self) -> _Reading:
         audit, sample, mounting = Audit(), RangeSample(), MountingEstimate()
-        scans, odometry, parameters = PathSummary(), PathSummary(), dict[str, str]()
+        scans, odometry = PathSummary(), PathSummary()
         declared = self._first_look()
         gate = ScanGate(declared, audit)
         telling: ScanLine | None = None
         for number, line in _sound(self._all_lines(), audit):
-            if isinstance(line, ParameterLine):
-                parameters[line.name] = line.value
-            elif isinstance(line, OdometryLine):
+            if isinstance(line, OdometryLine):
                 odometry.add(line.stamp, line.T_odom_base)
             elif gate.admits(number, line.stamp, beams_of(line, declared)):
                 _note_clock(number, line, audit)
@@ -141,7 +124,7 @@ class TextLog:
         pose_from_odometry = not scans.moves and odometry.moves
         driven = odometry if pose_from_odometry else scans
         check_units(path, driven)
-        laser = laser_model(telling, parameters, mounting)
+        laser = laser_model(telling, self._parameters, mounting)
         notes = [f"the odometry {driven.fault}; it is not used", WITHOUT_ODOMETRY] if driven.fault else []
         placeholders = sample.placeholders()
         survey = Survey(
@@ -155,13 +138,11 @@ class TextLog:
         return _Reading(survey, pose_from_odometry, driven.fault is None, placeholders)
 
     def _first_look(self) -> Beams:
-        audit, scans, parameters = Audit(), list[ScanLine](), dict[str, str]()
+        audit, scans = Audit(), list[ScanLine]()
         for _, line in _sound(self._all_lines(), audit):
-            if isinstance(line, ParameterLine):
-                parameters[line.name] = line.value
-            elif isinstance(line, ScanLine):
+            if isinstance(line, ScanLine):
                 scans.append(line)
-            if len(scans) == SCANS_THAT_VOTE:
+            if len(scans) == FIRST_MESSAGES:
                 break
         if not scans:
             seen = f"; {audit.faults()}" if audit.faults() else ""
@@ -169,11 +150,11 @@ class TextLog:
                 f"{self._path}: no laser scan in this CARMEN log{seen}; its lines are {self._kinds()}; "
                 "give a log with scans"
             )
-        return usual_log_beams(scans, parameters)
+        return usual_log_beams(scans, self._parameters)
 
     def _kinds(self) -> str:
         words = (text.split(None, 1)[:1] for _, text in numbered_lines(self._path))
-        counts = Counter(word[0][:_LONGEST_WORD].decode("ascii", "replace") for word in words if word)
+        counts = Counter(word[0].decode("ascii", "replace") for word in words if word)
         return ", ".join(f"{count} {one_line(word)}" for word, count in counts.most_common(_WORDS_NAMED))
 
     def _all_lines(self) -> Iterable[NumberedLine]:
@@ -181,6 +162,7 @@ class TextLog:
 
     def _parsed(self) -> Iterator[NumberedLine]:
         parse = CarmenParser(is_raw(head(self._path)))
+        self._parameters = parse.parameters
         kept, size, untimed = list[NumberedLine](), 0, 0
         for number, text in numbered_lines(self._path):
             try:
@@ -201,17 +183,16 @@ class TextLog:
         if size <= self._kept_bytes:
             self._kept = kept
 
-    def _entries(
-        self, scans: ScanRange, lines: Iterable[NumberedLine], audit: Audit
-    ) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
+    def _entries(self, scans: ScanRange, lines: Iterable[NumberedLine], audit: Audit) -> Iterator[tuple[int, Line]]:
+        """The lines with the poses of the scans."""
         for number, entry in scan_window(
-            self._posed(lines, audit), scans, lambda entry: isinstance(entry, _Scan), audit
+            self._posed(lines, audit), scans, lambda entry: isinstance(entry, ScanLine), audit
         ):
-            if isinstance(entry, _Scan):
-                _note_clock(number, entry.line, audit)
+            if isinstance(entry, ScanLine):
+                _note_clock(number, entry, audit)
             yield number, entry
 
-    def _posed(self, lines: Iterable[NumberedLine], audit: Audit) -> "Iterator[tuple[int, _Scan | OdometryLine]]":
+    def _posed(self, lines: Iterable[NumberedLine], audit: Audit) -> Iterator[tuple[int, Line]]:
         reading = self._reading
         declared = reading.survey.lasers[0].beams
         gate = ScanGate(declared, audit)
@@ -220,12 +201,10 @@ class TextLog:
             if isinstance(line, OdometryLine):
                 latest = line
                 yield number, line
-            elif isinstance(line, ScanLine):
-                beams = beams_of(line, declared)
-                if gate.admits(number, line.stamp, beams) and beams is not None:
-                    late = latest if reading.pose_from_odometry else None
-                    pose = (late or line).T_odom_base if reading.has_odometry else UNKNOWN_POSE
-                    yield number, _Scan(line, beams, pose)
+            elif gate.admits(number, line.stamp, beams_of(line, declared)):
+                late = latest if reading.pose_from_odometry else None
+                pose = (late or line).T_odom_base if reading.has_odometry else UNKNOWN_POSE
+                yield number, line._replace(T_odom_base=pose)
 
 
 def _note_clock(number: int, line: ScanLine, audit: Audit) -> None:
