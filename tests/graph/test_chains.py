@@ -35,7 +35,7 @@ def apart_m(a: FloatArray, b: FloatArray) -> float:
 def test_every_trusted_edge_is_in_one_chain_and_only_passed_variables_are_inside() -> None:
     graph = loops(0)
     chains, edges = find_chains(graph), graph.arrays()
-    assert sum(len(step.chains) for step in chains.steps) == np.count_nonzero(~edges.robust)
+    assert sum(len(members) for members, *_ in chains.steps) == np.count_nonzero(~edges.robust)
     closed = set(edges.i[edges.robust]) | set(edges.j[edges.robust])
     assert closed <= set(chains.kept.tolist())
     assert {0, len(graph) - 1} <= set(chains.kept.tolist())

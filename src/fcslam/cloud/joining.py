@@ -119,7 +119,7 @@ def reevaluate(
 
 
 def _evidence(graph: JointGraph, entries: list[ClosureEntry]) -> JointEvidence:
-    count, rows = len(graph.graph.edges), np.array([entry.edge for entry in entries], np.int64)
+    count, rows = graph.graph.edge_count, np.array([entry.edge for entry in entries], np.int64)
     informative, independent, vetoed = np.ones(count, bool), np.zeros(count, bool), np.zeros(count, bool)
     tags = np.zeros(count, np.int64)
     informative[rows] = [entry.closure.informative for entry in entries]

@@ -197,7 +197,7 @@ class JointGraph:
 
     def _kept(self) -> NDArray[np.bool_]:
         """Edges that count, shape (E,)."""
-        kept = np.ones(len(self.graph.edges), dtype=bool)
+        kept = np.ones(self.graph.edge_count, dtype=bool)
         kept[list(self._left_out)] = False
         return kept
 

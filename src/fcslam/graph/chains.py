@@ -16,6 +16,10 @@ from fcslam.records import FloatArray
 LONGEST = 16
 """Most edges of a chain: the combined edge holds to first order in the errors of its parts."""
 
+Step = tuple[NDArray[np.int64], NDArray[np.int64], FloatArray, FloatArray, FloatArray]
+"""One edge in each of K chains: the chains and the variables at its end, shape (K,) each, its motion (K, 3) and
+covariance (K, 3, 3), and what takes a tangent vector at its end to one at the end of the chain, shape (K, 3, 3)."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chains:
@@ -31,7 +35,7 @@ class Chains:
     """Motion along each chain, shape (C, 3)."""
     information: FloatArray
     """Information of that motion in the tangent space at it, shape (C, 3, 3)."""
-    steps: tuple["_Step", ...]
+    steps: tuple[Step, ...]
     """The first edges of all chains, then the second ones of those that have one, and so on."""
 
     def contract(self, graph: PoseGraph) -> PoseGraph:
@@ -62,26 +66,13 @@ class Chains:
         misfit = se2.log(se2.between(self.T_i_j, se2.between(poses[self.i], poses[self.j])))
         pull = np.einsum("cab,cb->ca", self.information, misfit)
         at = poses[self.i]
-        for step in self.steps:
-            chains = step.chains
+        for chains, j, T_i_j, covariance, to_end in self.steps:
             # The pull at the end of the chain, in the tangent space at the end of this edge.
-            here = np.einsum("cba,cb->ca", step.to_end, pull[chains])
-            correction = np.einsum("cab,cb->ca", step.covariance, here)
-            at[chains] = se2.compose(at[chains], se2.compose(step.T_i_j, se2.exp(correction)))
-            inside = step.j != self.j[chains]
-            poses[step.j[inside]] = at[chains[inside]]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Step:
-    chains: NDArray[np.int64]
-    """Shape (K,)."""
-    j: NDArray[np.int64]
-    """Variable at its end, shape (K,)."""
-    T_i_j: FloatArray
-    covariance: FloatArray
-    to_end: FloatArray
-    """Takes a tangent vector at its end to one at the end of the chain, shape (K, 3, 3)."""
+            here = np.einsum("cba,cb->ca", to_end, pull[chains])
+            correction = np.einsum("cab,cb->ca", covariance, here)
+            at[chains] = se2.compose(at[chains], se2.compose(T_i_j, se2.exp(correction)))
+            inside = j != self.j[chains]
+            poses[j[inside]] = at[chains[inside]]
 
 
 def find_chains(graph: PoseGraph) -> Chains:
@@ -144,7 +135,7 @@ def _combined(
     to_end = np.tile(np.eye(3), (count, 1, 1))
     steps = []
     for chains, rows in reversed(walked):
-        steps.append(_Step(chains, edges.j[rows], edges.T_i_j[rows], covariances[rows], to_end[chains]))
+        steps.append((chains, edges.j[rows], edges.T_i_j[rows], covariances[rows], to_end[chains]))
         to_end[chains] = to_end[chains] @ se2.adjoint(se2.inverse(edges.T_i_j[rows]))
     information = np.linalg.inv(covariance)
     symmetric = np.asarray(0.5 * (information + information.swapaxes(-1, -2)), dtype=np.float64)

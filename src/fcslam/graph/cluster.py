@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import two_point_alignment
-from fcslam.graph.clique import maximum_clique
+from fcslam.graph.clique import NODE_BUDGET, maximum_clique
 from fcslam.graph.consistency import Closures, pairwise_consistency
 from fcslam.graph.evidence import LEAD, ClusterEvidence, ConsistencySettings, MapFit, refutation, shortfall
 from fcslam.graph.trajectory import Trajectory
@@ -29,7 +29,7 @@ MOST_CLUSTERS = 4
 DIRECTION_M = 1.0
 """Least distance between two matched points that fixes a rotation: each point is known to a few centimetres."""
 
-_SEPARATE_BUDGET = 500
+_SEPARATE_BUDGET = NODE_BUDGET // 100
 """Branches searched for the largest set of separate places; beyond them the result is a lower bound."""
 _MEAN_ROUNDS = 10
 

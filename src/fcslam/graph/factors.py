@@ -54,7 +54,7 @@ class FactorCache:
         part._trusted = gtsam.NonlinearFactorGraph(self._trusted)
         unit = zip(self._closures_under(Loss.SQUARED), kept.tolist(), strict=True)
         part._closures[Loss.SQUARED] = [factor for factor, keep in unit if keep]
-        part._built = len(graph.edges)
+        part._built = graph.edge_count
         return part
 
     def values(self, poses: FloatArray, solved: NDArray[np.bool_] | None = None) -> Any:
@@ -144,7 +144,7 @@ class FactorCache:
         self, graph: Any, kept: NDArray[np.bool_], poses: FloatArray, solved: NDArray[np.bool_] | None = None
     ) -> None:
         """Add a prior on the first variable of every connected component that is ``solved``."""
-        connects = np.ones(len(self.graph.edges), dtype=bool)
+        connects = np.ones(self.graph.edge_count, dtype=bool)
         connects[self.graph.arrays().robust] = kept
         noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
         firsts = anchors(self.graph.components(connects))

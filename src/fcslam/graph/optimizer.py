@@ -69,7 +69,7 @@ def optimize(
         Poses (N, 3) and weights (E,).
     """
     start, cache = _start(graph, initial), _cache(graph, factors)
-    if not graph.edges:
+    if not graph.edge_count:
         return _solution(graph, start, start, np.ones(0), 0, 0.0)
     robust = graph.arrays().robust
     counts = np.ones(int(robust.sum()), dtype=bool) if kept is None else np.asarray(kept, dtype=bool)[robust]
@@ -101,7 +101,7 @@ def optimize_gnc(
     """
     start, cache = _start(graph, initial), _cache(graph, factors)
     robust = graph.arrays().robust
-    if not graph.edges:
+    if not graph.edge_count:
         return _solution(graph, start, start, np.ones(0), 0, 0.0)
     steps = _Steps(cache, start)
     steps.solve(np.ones(int(robust.sum())), _FIRST_ITERATIONS)
@@ -126,9 +126,9 @@ def refine_inliers(
     """
     start, cache = _start(graph, initial), _cache(graph, factors)
     trusted = np.asarray(weights, dtype=np.float64)
-    if trusted.shape != (len(graph.edges),):
-        raise ValueError(f"weights must be of shape ({len(graph.edges)},), not {trusted.shape}")
-    if not graph.edges:
+    if trusted.shape != (graph.edge_count,):
+        raise ValueError(f"weights must be of shape ({graph.edge_count},), not {trusted.shape}")
+    if not graph.edge_count:
         return _solution(graph, start, start, np.ones(0), 0, 0.0)
     robust = graph.arrays().robust
     steps = _Steps(cache, start)
@@ -230,7 +230,7 @@ def _solution(
     graph: PoseGraph, start: FloatArray, poses: FloatArray, closure_weights: FloatArray, iterations: int, cost: float
 ) -> Solution:
     """The solution, with each connected component moved so that its first variable is at its initial pose."""
-    weights = np.ones(len(graph.edges))
+    weights = np.ones(graph.edge_count)
     weights[graph.arrays().robust] = closure_weights
     components = graph.components(weights > 0.0)
     first = anchors(components)

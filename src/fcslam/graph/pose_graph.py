@@ -1,8 +1,8 @@
 """A pose graph in the plane: variables numbered from 0, measured motions between them. It only grows."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Self, overload
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ from fcslam.records import FloatArray, frozen
 MAXIMUM_INFORMATION = 1e8
 """Largest eigenvalue of an information matrix, 0.1 mm or 0.1 mrad: stiffer edges make the systems ill-conditioned."""
 
-_MINIMUM_INFORMATION = 1e-4
+_MINIMUM_INFORMATION = 1e-12 * MAXIMUM_INFORMATION
 """Smallest eigenvalue of a bounded matrix, where rounding may have destroyed small ones."""
 
 _ASYMMETRY = 1e-6
@@ -73,7 +73,7 @@ class PoseGraph:
 
     def __init__(self, poses: ArrayLike = (), edges: Iterable[Edge] = ()) -> None:
         self._poses = Rows(np.zeros((0, 3)))
-        self._edges = _EdgeRows(_NO_EDGES)
+        self._set_edges(_NO_EDGES)
         for pose in np.asarray(poses, dtype=np.float64).reshape(-1, 3):
             self.add_variable(pose)
         for edge in edges:
@@ -83,16 +83,35 @@ class PoseGraph:
     def restored(cls, poses: FloatArray, edges: EdgeArrays) -> Self:
         """A graph from the poses (N, 3) and edges of another one, which were checked when they were added to it."""
         graph = cls()
-        graph._poses, graph._edges = Rows(poses), _EdgeRows(edges)
+        graph._poses = Rows(poses)
+        graph._set_edges(edges)
         return graph
+
+    def _set_edges(self, edges: EdgeArrays) -> None:
+        """``edges`` with the information that was given."""
+        self._i, self._j, self._robust = Rows(edges.i), Rows(edges.j), Rows(edges.robust)
+        self._T_i_j, self._information = Rows(edges.T_i_j), Rows(edges.information)
+        self._given: dict[int, FloatArray] = {}
+        """The given information of those edges where it was bounded."""
+        self._bounded = 0
+        """Edges whose information is bounded where it has to be."""
 
     def __len__(self) -> int:
         return len(self._poses)
 
     @property
-    def edges(self) -> Sequence[Edge]:
-        """Edges in the order in which they were added; each is made of its row when it is asked for."""
-        return self._edges
+    def edge_count(self) -> int:
+        """Number of edges."""
+        return len(self._i)
+
+    @property
+    def edges(self) -> list[Edge]:
+        """Edges in the order in which they were added, as they were given; ``arrays`` takes less time."""
+        rows, given = range(self.edge_count), self.given()
+        return [
+            Edge(int(given.i[k]), int(given.j[k]), given.T_i_j[k], given.information[k], bool(given.robust[k]))
+            for k in rows
+        ]
 
     def add_variable(self, pose: ArrayLike) -> int:
         """Append a variable with its initial pose (3,); returns its number."""
@@ -102,7 +121,14 @@ class PoseGraph:
         """Append an edge; returns its number."""
         if max(edge.i, edge.j) >= len(self):
             raise ValueError(f"edge {edge.i} -> {edge.j}: the graph has variables 0 to {len(self) - 1}")
-        return self._edges.append(edge)
+        for rows, value in (
+            (self._i, edge.i),
+            (self._j, edge.j),
+            (self._robust, edge.robust),
+            (self._T_i_j, edge.T_i_j),
+        ):
+            rows.append(value)
+        return self._information.append(edge.information)
 
     def poses(self) -> FloatArray:
         """Initial poses, shape (N, 3)."""
@@ -110,11 +136,20 @@ class PoseGraph:
 
     def given(self) -> EdgeArrays:
         """Edges as arrays with the information that was given, for ``restored``."""
-        return self._edges.given()
+        information = self._information.values.copy()
+        for row, matrix in self._given.items():
+            information[row] = matrix
+        return replace(self.arrays(), information=information)
 
     def arrays(self) -> EdgeArrays:
-        """Edges as arrays."""
-        return self._edges.bounded()
+        """Edges as arrays; eigenvalues of the information are at most MAXIMUM_INFORMATION."""
+        information = self._information.values
+        new = information[self._bounded :]
+        stiff = np.flatnonzero(np.einsum("eaa->e", new) > MAXIMUM_INFORMATION)
+        self._given |= {self._bounded + row: frozen(new[row]) for row in stiff.tolist()}
+        new[stiff] = _bounded(new[stiff])
+        self._bounded = self.edge_count
+        return EdgeArrays(self._i.values, self._j.values, self._T_i_j.values, information, self._robust.values)
 
     def restricted(self, poses: FloatArray, kept: NDArray[np.bool_]) -> "PoseGraph":
         """All variables, at ``poses`` (N, 3), with the edges where ``kept`` (E,) is true."""
@@ -166,66 +201,6 @@ def _root(first, variable):  # type: ignore[no-untyped-def]
 def anchors(components: NDArray[np.int64]) -> NDArray[np.int64]:
     """First variable of each connected component, shape (C,); ``components`` as from ``PoseGraph.components``, (N,)."""
     return np.unique(components, return_index=True)[1].astype(np.int64)
-
-
-class _EdgeRows(Sequence[Edge]):
-    def __init__(self, edges: EdgeArrays) -> None:
-        """``edges`` with the information that was given."""
-        self._i, self._j, self._robust = Rows(edges.i), Rows(edges.j), Rows(edges.robust)
-        self._T_i_j, self._information = Rows(edges.T_i_j), Rows(edges.information)
-        self._given: dict[int, FloatArray] = {}
-        """The given information of those edges where it was bounded."""
-        self._bounded = 0
-        """Edges whose information is bounded where it has to be."""
-
-    def __len__(self) -> int:
-        return len(self._i)
-
-    @overload
-    def __getitem__(self, index: int) -> Edge: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Edge]: ...
-    def __getitem__(self, index: int | slice) -> Edge | Sequence[Edge]:
-        if isinstance(index, slice):
-            return [self[k] for k in range(*index.indices(len(self)))]
-        row = range(len(self))[index]
-        information = self._given.get(row)
-        edge = object.__new__(Edge)  # checked when it was added
-        for name, value in (
-            ("i", int(self._i.values[row])),
-            ("j", int(self._j.values[row])),
-            ("T_i_j", frozen(self._T_i_j.values[row])),
-            ("information", frozen(self._information.values[row]) if information is None else information),
-            ("robust", bool(self._robust.values[row])),
-        ):
-            object.__setattr__(edge, name, value)
-        return edge
-
-    def append(self, edge: Edge) -> int:
-        for rows, value in (
-            (self._i, edge.i),
-            (self._j, edge.j),
-            (self._robust, edge.robust),
-            (self._T_i_j, edge.T_i_j),
-        ):
-            rows.append(value)
-        return self._information.append(edge.information)
-
-    def given(self) -> EdgeArrays:
-        information = self._information.values.copy()
-        for row, matrix in self._given.items():
-            information[row] = matrix
-        return replace(self.bounded(), information=information)
-
-    def bounded(self) -> EdgeArrays:
-        """Eigenvalues of the information are at most MAXIMUM_INFORMATION."""
-        information = self._information.values
-        new = information[self._bounded :]
-        stiff = np.flatnonzero(np.einsum("eaa->e", new) > MAXIMUM_INFORMATION)
-        self._given |= {self._bounded + row: frozen(new[row]) for row in stiff.tolist()}
-        new[stiff] = _bounded(new[stiff])
-        self._bounded = len(self)
-        return EdgeArrays(self._i.values, self._j.values, self._T_i_j.values, information, self._robust.values)
 
 
 def _bounded(information: FloatArray) -> FloatArray:
