@@ -9,7 +9,7 @@ from fcslam.anchoring.lengths import lengths_in_plan
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.geometry import se2
 from fcslam.graph.evidence import LEAD
-from fcslam.lidar.submap import SPACING_M, Submap, agreement
+from fcslam.lidar.submap import ON_SURFEL_M, SPACING_M, Submap, agreement
 from fcslam.records import FloatArray
 
 LEAST_EXPLAINED: Final = 0.7
@@ -19,11 +19,11 @@ MOST_VIOLATION: Final = 0.25
 LEAST_SURFACE_M: Final = 25.0
 """Least length of the plan's surface that the scans saw, and of the map's surface that the plan has."""
 LEAST_SHARE: Final = 0.3
-"""Least share of the map's surface that the plan has: the rest is furniture."""
-LEAST_RIVAL_M: Final = 10.0
+"""Least share of the surface of a map, or of a scan, that the plan has: the rest is furniture."""
+LEAST_RIVAL_M: Final = 0.4 * LEAST_SURFACE_M
 """Score of an alignment elsewhere that is always assumed."""
-LEAST_THICKNESS_M, MOST_THICKNESS_M = 0.02, 0.15
-"""Walls that differ in thickness by this much on each side are drawn as lines of another width, or as one line."""
+MOST_THICKNESS_M: Final = ON_SURFEL_M
+"""Walls that differ in thickness by less on each side are drawn as lines of another width, or as one line."""
 DIRECTED: Final = 0.5
 """Least length of the mean direction of walls, modulo a right angle, from which headings are chosen."""
 
@@ -87,8 +87,8 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
         if found is None:
             return None
         best, lead = found
-    thickness_m = lengths_in_plan(target, building, best.T_a_b).thickness_m
-    if LEAST_THICKNESS_M < abs(thickness_m) < MOST_THICKNESS_M:
+    _, thickness_m = lengths_in_plan(target, building, best.T_a_b)
+    if 0.0 < abs(thickness_m) < MOST_THICKNESS_M:
         plan = replace(plan, thickness_m=thickness_m)
         target = plan.submap
         best = align_map(target, building, best.T_a_b)

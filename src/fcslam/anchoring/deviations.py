@@ -12,11 +12,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from fcslam.anchoring.alignment import LEAST_SHARE
 from fcslam.lidar.field import EMPTY, SurfelField
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Submap
+from fcslam.maps.changes import TOLERANCE_M
 from fcslam.records import FloatArray
 
-OFF_M: Final = 0.10
+OFF_M: Final = TOLERANCE_M
 """A wall that is off by less stands where the plan has it."""
 AWAY_M: Final = 3.0 * OFF_M
 """A surface farther than this from any surface of the other map is not in that map."""
@@ -24,14 +26,12 @@ SHORTEST_M: Final = 1.5
 """Shortest wall that is missing or moved: shorter lines of a plan are furniture and doors."""
 SHORTEST_NEW_M: Final = 2.0
 """Shortest new wall, as shorter surfaces are furniture; a missing wall that stands parallel within it has moved."""
-HIDDEN_M: Final = 1.0
+HIDDEN_M: Final = 0.5 * SHORTEST_NEW_M
 """A new wall this close to a wall of the plan that no scan can see is that wall."""
-_STEPS: Final = 6
+_STEPS: Final = round(2.0 * AWAY_M / SPACING_M)
 """Steps of ``SPACING_M`` to either side in which a wall is looked for."""
 JOINED_M: Final = 0.35
 """Points of one wall are at most this far apart."""
-LEAST_OFF: Final = 0.3
-"""Least share of a wall's points with a wall close by, by which its distance is known."""
 PARALLEL: Final = 0.94
 """Least cosine between the normals of one wall."""
 
@@ -188,7 +188,8 @@ def _walls(points: FloatArray, normals: FloatArray, across: FloatArray, chosen: 
     for members in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
         off = np.abs(across[rows[members]])
         off = off[off > OFF_M]  # false for NaN
-        its_off_m = float(np.median(off)) if len(off) >= LEAST_OFF * len(members) else None
+        is_known = len(off) >= LEAST_SHARE * len(members)  # enough of it has a wall close by
+        its_off_m = float(np.median(off)) if is_known else None
         yield _Wall(xy[members], its[members], its_off_m)
 
 

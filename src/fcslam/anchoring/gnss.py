@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.anchoring.part import MapPart, position_prior
+from fcslam.anchoring.part import LEAST_SIGMA_M, ROUNDS, MapPart, position_prior
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
 from fcslam.graph.anchored import optimize_anchored
@@ -26,11 +26,8 @@ LEAST_FIXES, LEAST_SHARE = 10, 0.3
 """Least number of fixes that agree, and least share of them."""
 MOST_TURN_RAD: Final = float(np.radians(3.0))
 """Largest standard deviation of the map's heading by the fixes that agree."""
-LEAST_SIGMA_M: Final = 0.02
-"""Least standard deviation of a fix, whatever its robot says."""
 HYPOTHESES: Final = 400
 """Pairs of fixes from which the pose of the map is guessed."""
-ROUNDS: Final = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)

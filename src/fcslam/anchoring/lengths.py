@@ -1,6 +1,6 @@
 """The lengths of a map compared with those of a floor plan."""
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -21,24 +21,19 @@ _CORRELATED: Final = 20.0
 """Points of a wall whose errors are those of one point."""
 
 
-class Lengths(NamedTuple):
-    """How the lengths of a map differ from those of a plan."""
-
-    scale: float
-    """Factor that brings the map's lengths into the scale of the plan; 1 if it is not clearly another."""
-    thickness_m: float
-    """By how much the sides of walls lie farther from their middle than the plan draws them."""
-
-
-def lengths_in_plan(plan: Submap, building: Submap, T_plan_map: FloatArray) -> Lengths:
+def lengths_in_plan(plan: Submap, building: Submap, T_plan_map: FloatArray) -> tuple[float, float]:
     """Compare the lengths of a map with those of a plan, by the walls of both.
 
     Motion, scale and thickness of the walls are found together: a plan that shows the middle lines of walls makes no
     building larger. The map, or one robot's part of it, lies about at ``T_plan_map``, shape (3,), metres and radians.
+
+    Returns:
+        The factor that brings the map's lengths into the scale of the plan, 1 if it is not clearly another, and by how
+        much the sides of walls lie farther from their middle than the plan draws them, metres.
     """
     points, normals = se2.transform(T_plan_map, building.surface.points), building.surface.normals
     if not len(points):
-        return Lengths(1.0, 0.0)
+        return 1.0, 0.0
     middle, field = points.mean(axis=0), plan.field
     motion, scale, thickness = np.zeros(3), 1.0, 0.0
     variance = np.inf
@@ -54,7 +49,7 @@ def lengths_in_plan(plan: Submap, building: Submap, T_plan_map: FloatArray) -> L
         same = np.einsum("na,na->n", its, facing) > -OPPOSED
         apart, arms, its = apart[same], arms[same], its[same]
         if len(apart) < 50:
-            return Lengths(1.0, 0.0)
+            return 1.0, 0.0
         across = np.einsum("na,na->n", its, apart)
         along2 = np.maximum(0.0, np.einsum("na,na->n", apart, apart) - across**2)
         off = across - thickness
@@ -68,4 +63,4 @@ def lengths_in_plan(plan: Submap, building: Submap, T_plan_map: FloatArray) -> L
         variance = _CORRELATED * float((weight * off**2).sum() / weight.sum()) * float(np.linalg.inv(H)[3, 3])
     changed = abs(scale - 1.0)
     clear = changed > max(LEAST_SCALE, SIGNIFICANT * variance**0.5) and changed <= LARGEST_SCALE
-    return Lengths(float(scale) if clear else 1.0, float(thickness))
+    return float(scale) if clear else 1.0, float(thickness)

@@ -12,6 +12,10 @@ from fcslam.graph.anchored import PosePrior
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray, frozen
 
+LEAST_SIGMA_M: Final = 0.02
+"""Least standard deviation of a position outside of the map, by a survey or a receiver, whatever they say."""
+ROUNDS: Final = 4
+"""Finding what such positions say about the poses, and solving, alternate this often."""
 _HEADING_INFORMATION: Final = 1e-6
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
+from fcslam.lidar.field import WIDEST_M
+from fcslam.maps.drawing import SUBPIXEL_BITS
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.maps.ros_map import decoded_image, read_ros_map
 from fcslam.records import FloatArray, frozen
@@ -18,21 +20,17 @@ DXF_CELL_M: Final = 0.02
 """Side of a cell in which a DXF drawing is drawn."""
 MOST_PIXELS: Final = 1 << 27
 """Largest number of pixels of a plan; 230 m by 230 m in pixels of 2 cm."""
-WIDEST_M: Final = 400.0
-"""Largest width and height of a plan."""
 TEXT_M: Final = 0.5
 """Lines that are connected and no longer and no higher than this are text and symbols."""
 WALL_M: Final = 0.2
 """Two lines this close together are the sides of one wall."""
-FAINTEST: Final = 30
+COLOUR_STEP: Final = 16
+"""Colours in steps of this size are one colour where the background is found."""
+FAINTEST: Final = 2 * COLOUR_STEP
 """Least difference of the darkest lines from the background, in grey levels of 255."""
 FAINT_SHARE: Final = 0.4
 """Lines differ from the background by at least this share of the difference of the darkest ones: fills are fainter."""
-_COLOUR_STEP: Final = 16
-"""Colours in steps of this size are one colour where the background is found."""
-_SHIFT: Final = 4
-"""Fractional bits of the coordinates that OpenCV takes."""
-_FLATNESS_M: Final = 0.005
+_FLATNESS_M: Final = 0.25 * DXF_CELL_M
 """Largest distance of an arc from the line segments that replace it."""
 _NOT_WALLS: Final = ("TEXT", "MTEXT", "ATTRIB", "ATTDEF", "DIMENSION", "LEADER", "MULTILEADER", "IMAGE", "WIPEOUT")
 """Kinds of entities of a DXF drawing that show no walls."""
@@ -103,7 +101,7 @@ def _colours(pixels: NDArray[Any]) -> NDArray[np.uint8]:
 
 def _lines(colours: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Pixels that clearly differ from the background, the most frequent colour; shape (H, W)."""
-    rough = (colours // _COLOUR_STEP).astype(np.int32)
+    rough = (colours // COLOUR_STEP).astype(np.int32)
     numbers = (rough[..., 0] * 256 + rough[..., 1]) * 256 + rough[..., 2]
     known, counts = np.unique(numbers, return_counts=True)
     background = np.median(colours[numbers == known[np.argmax(counts)]], axis=0)
@@ -164,8 +162,8 @@ def _dxf_plan(path: Path, scale: float | None) -> OccupancyMap:
     width, height = np.ceil(size_m / cell_m).astype(int).tolist()
     cells = np.full((height, width), Occupancy.FREE, np.uint8)
     for line in lines:
-        corners = np.round(((line - low) / cell_m - 0.5) * (1 << _SHIFT)).astype(np.int32)
-        cv2.polylines(cells, [corners], False, int(Occupancy.OCCUPIED), 1, cv2.LINE_8, _SHIFT)
+        corners = np.round(((line - low) / cell_m - 0.5) * (1 << SUBPIXEL_BITS)).astype(np.int32)
+        cv2.polylines(cells, [corners], False, int(Occupancy.OCCUPIED), 1, cv2.LINE_8, SUBPIXEL_BITS)
     return OccupancyMap(cells, cell_m, (float(low[0]), float(low[1])))
 
 

@@ -6,13 +6,14 @@ from typing import Final
 
 import numpy as np
 
+from fcslam.anchoring.alignment import LEAST_SHARE
 from fcslam.anchoring.lengths import lengths_in_plan
-from fcslam.anchoring.part import MapPart
+from fcslam.anchoring.part import ROUNDS, MapPart
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.cloud.result import MappedRobot
 from fcslam.geometry import se2
 from fcslam.graph.anchored import PosePrior, optimize_anchored
-from fcslam.graph.pose_graph import PoseGraph
+from fcslam.graph.pose_graph import CHI2_LIMIT, PoseGraph
 from fcslam.lidar import matching
 from fcslam.lidar.field import CELL_M
 from fcslam.lidar.matching import match_scan
@@ -24,12 +25,6 @@ WEAK_M, WEAK_RAD = 0.05, 0.02
 """Least standard deviations of a pose by the plan, which is no more precise, however many points agree."""
 POINT_SIGMA_M: Final = 0.15
 """Standard deviation of a wall in the plan, per point of a scan: errors of a plan are the same for all its points."""
-LEAST_EXPLAINED: Final = 0.3
-"""Least share of a scan's points that lie on walls of the plan."""
-FARTHEST_CHI2: Final = 11.3
-"""A pose by the plan that is farther from the map's own is wrong: the 99 % quantile of three degrees of freedom."""
-ROUNDS: Final = 4
-"""Matching and solving alternate this often."""
 
 
 def map_submap(robots: Sequence[MappedRobot]) -> Submap:
@@ -49,7 +44,7 @@ def fit_to_plan(plan: BuildingPlan, part: MapPart, T_plan_map: FloatArray) -> tu
     """
     robots, graph = part.robots, part.graph
     found = {
-        robot.robot: lengths_in_plan(plan.submap, map_submap([robot]), T_plan_map).scale if robot.keyscans else 1.0
+        robot.robot: lengths_in_plan(plan.submap, map_submap([robot]), T_plan_map)[0] if robot.keyscans else 1.0
         for robot in robots
     }
     middle = np.append(plan.submap.surface.points.mean(axis=0), 0.0)
@@ -73,7 +68,7 @@ def fit_to_plan(plan: BuildingPlan, part: MapPart, T_plan_map: FloatArray) -> tu
     for number in range(ROUNDS):
         priors = _priors(plan, scans, poses, wide_scale_m=0.4 if number == 0 else 0.2)
         if number:
-            priors = [prior for prior in priors if prior.chi2(poses) < FARTHEST_CHI2]
+            priors = [prior for prior in priors if prior.chi2(poses) < CHI2_LIMIT]
         if not priors:
             break
         poses = optimize_anchored(fitted.graph, poses, priors)
@@ -101,7 +96,7 @@ def _priors(
     priors = []
     for variable, scan in scans:
         found = match_scan(scan, plan.submap.field, poses[variable], np.zeros((3, 3)), wide_scale_m=wide_scale_m)
-        if found.explained < LEAST_EXPLAINED:
+        if found.explained < LEAST_SHARE:
             continue
         information = found.information * (matching.POINT_SIGMA_M / POINT_SIGMA_M) ** 2 + 1e-2 * np.eye(3)
         covariance = np.linalg.inv(information) + np.diag((WEAK_M**2, WEAK_M**2, WEAK_RAD**2))

@@ -13,13 +13,15 @@ from typing import Any, Final
 import numpy as np
 from pydantic import Field, NonNegativeInt, ValidationError
 
-from fcslam.anchoring.part import MapPart, position_prior
+from fcslam.anchoring.part import LEAST_SIGMA_M, ROUNDS, MapPart, position_prior
 from fcslam.cloud.result import MappedRobot
 from fcslam.config import StrictModel, one_line, parse_yaml
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
 from fcslam.graph.anchored import optimize_anchored
+from fcslam.graph.cluster import DIRECTION_M
+from fcslam.graph.consistency import TAG_VIEWS
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray, Tag, TagFamily, TagSighting
 from fcslam.untrusted import MOST_TEXT_BYTES, read_text
@@ -28,22 +30,15 @@ ONE_VISIT: Final = 40
 """A session that sees a tag again after more keyscans has come back to it."""
 ELSEWHERE_M: Final = 0.2
 """Visits that see a tag farther apart contradict each other."""
-FEWEST_SIGHTINGS: Final = 2
-"""A place of a tag that fewer sightings show says nothing."""
 SCALE_ERROR: Final = 0.05
 """A robot whose distances to tags are off by a larger share is reported."""
 SCALE_SIGMAS: Final = 5.0
-SURVEY_SIGMA_M: Final = 0.02
-"""Standard deviation of a surveyed position."""
 ALIGNED_M: Final = 0.5
 """A surveyed tag agrees with the map as it is if it lies within this of its place."""
-LARGEST_OFF_M: Final = 0.15
+LARGEST_OFF_M: Final = ELSEWHERE_M
 """A surveyed tag that is farther off in the solution does not count."""
-BASELINE_M: Final = 1.0
-"""Least distance of two surveyed tags that place a map without their headings."""
 MOST_PAIRS: Final = 2000
 """Pairs of surveyed tags that propose a motion of the map; the longest baselines count."""
-_ROUNDS: Final = 3
 
 Survey = Mapping[Tag, tuple[float, float, float | None]]
 """Position of each surveyed tag and the direction that it faces, metres and radians; None: it is not known."""
@@ -137,7 +132,7 @@ class MapTags:
         """What ``tags.json`` says about the tags of map ``k``."""
         rows = []
         for tag, places in self.places.items():
-            shown = [place for place in places if len(place.sightings) >= FEWEST_SIGHTINGS] or places[:1]
+            shown = [place for place in places if len(place.sightings) >= TAG_VIEWS] or places[:1]
             x, y, heading = shown[0].pose.tolist()
             rows.append(
                 {
@@ -238,7 +233,7 @@ def _aligned(seen: Mapping[Tag, FloatArray], survey: Survey) -> tuple[FloatArray
     pairs = np.column_stack(np.triu_indices(len(tags), 1))
     baselines_m = np.hypot(*(here[pairs[:, 0], :2] - here[pairs[:, 1], :2]).T)
     longest = np.argsort(-baselines_m, kind="stable")[:MOST_PAIRS]
-    pairs = pairs[longest[baselines_m[longest] >= BASELINE_M]]
+    pairs = pairs[longest[baselines_m[longest] >= DIRECTION_M]]
     motions = list(n_point_alignment(there[pairs], here[pairs, :2]))
     least = 2
     if not motions:
@@ -258,9 +253,9 @@ def _why_not_aligned(seen: Mapping[Tag, FloatArray], survey: Survey) -> str:
     if len(seen) == 1:
         return "one tag without yaw fixes no heading; give its yaw, or survey a second tag"
     a, b = max(combinations(seen, 2), key=lambda pair: _distances_m(seen, survey, *pair)[0])
-    if _distances_m(seen, survey, a, b)[0] < BASELINE_M:
+    if _distances_m(seen, survey, a, b)[0] < DIRECTION_M:
         return (
-            f"the tags that were seen are less than {BASELINE_M:g} m apart and fix no heading; give the yaw of one, "
+            f"the tags that were seen are less than {DIRECTION_M:g} m apart and fix no heading; give the yaw of one, "
             "or survey a tag farther away"
         )
     return _contradiction(seen, survey, a, b)
@@ -284,12 +279,12 @@ def _solve(graph: PoseGraph, poses: FloatArray, tags: MapTags, used: Sequence[Ta
     if len(used) < 2:
         return poses
     seen = {tag: tags.places[tag][0].sightings for tag in used}
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         priors = []
         for one in (one for tag in used for one in seen[tag]):
             variable = tags.variable(one)
             arm = se2.compose(np.array((0.0, 0.0, poses[variable, 2])), one.T_base_tag)[:2]
-            variance = np.linalg.inv(one.information)[:2, :2].trace() / 2.0 + SURVEY_SIGMA_M**2
+            variance = np.linalg.inv(one.information)[:2, :2].trace() / 2.0 + LEAST_SIGMA_M**2
             weight = 1.0 / (variance * len(seen[one.tag]))
             priors.append(position_prior(variable, survey[one.tag][:2] - arm, poses[variable, 2], weight))
         poses = optimize_anchored(graph, poses, priors)
