@@ -18,7 +18,7 @@ from fcslam.compiled import njit
 from fcslam.config import Settings
 from fcslam.geometry.beams import is_full_turn
 from fcslam.lidar.scan import beam_times, ray_at, rays_of
-from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap
+from fcslam.maps.occupancy_map import FARTHEST_M, Cells, Occupancy, OccupancyMap
 from fcslam.records import FloatArray, LaserModel, Ranges, Sweep
 
 Counts = NDArray[np.uint32]
@@ -34,8 +34,6 @@ CLEARANCE_CELLS = 2.0
 """A beam without return ends this far before the line between the returns beside it, which may be one surface."""
 SETTLED_PASSES = 1_000_000
 """Beams that each known cell of a finished map counts for: newer scans change it only if they contradict it."""
-FARTHEST_M = 1e7
-"""Poses farther from the origin are refused: floats no longer resolve cells there."""
 
 
 class OccupancyConfig(Settings):

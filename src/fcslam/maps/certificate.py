@@ -27,7 +27,7 @@ from fcslam.records import FloatArray
 
 SCALE: Final = 0.25
 """Ratio of true errors to the standard deviations of the graph."""
-CONTRADICTED: Final = 2.5
+CONTRADICTED: Final = 10.0 * SCALE
 """Ratio of true errors to the standard deviations of the graph, by the root mean square of what the edges of the graph
 leave as residuals: 1 if the measurements scatter as the graph expects."""
 FLOOR_M: Final = 0.008
@@ -45,9 +45,9 @@ PASS_GAP_S: Final = 20.0
 """Two scans of one robot with a longer gap between them are two passes."""
 OPEN_M: Final = 0.03
 """A motion is open if its weakest direction has a larger standard deviation."""
-OPEN_LENGTH_M: Final = 3.0
+OPEN_LENGTH_M: Final = 3.0 * CELL_M
 """Shorter open stretches are not named."""
-AGAIN_M: Final = 0.01
+AGAIN_M: Final = FLOOR_M
 AGAIN_PER_M: Final = 0.1 * AGAIN_M
 """Standard deviation of the motion that another drive between two places measures: constant, and by metre."""
 UNKNOWN_INFORMATION: Final = 1e-4

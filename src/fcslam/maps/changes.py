@@ -16,7 +16,7 @@ Mask = NDArray[np.bool_]
 
 TOLERANCE_M: Final = 0.10
 """A surface that has moved by less is the same one: poses are not more accurate over several periods."""
-JOINED_M: Final = 0.15
+JOINED_M: Final = 1.5 * TOLERANCE_M
 """Changed cells this close together are one region."""
 SMALLEST_M2: Final = 0.02
 """Smaller regions are not reported: eight cells of 0.05 m."""

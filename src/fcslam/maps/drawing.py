@@ -20,8 +20,8 @@ from fcslam.records import Channel, FloatArray
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
 
-LONG_SIDE_PX: Final = 1600
 MARGIN_PX: Final = 40
+LONG_SIDE_PX: Final = 40 * MARGIN_PX
 NARROWEST_PX: Final = 16 * MARGIN_PX
 """Smallest width of the picture, which the legend needs."""
 RAY_M: Final = 0.15
@@ -34,13 +34,13 @@ SWATCH_PX: Final = 34
 GAP_PX: Final = 14
 FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 FONT_SCALE: Final = 0.75
-CLOSURES_APART_M: Final = 1.5
+CLOSURES_APART_M: Final = 10.0 * RAY_M
 """Smallest distance between the midpoints of two drawn closures."""
 SUBPIXEL_BITS: Final = 4
 """Fractional bits of OpenCV's fixed-point coordinates."""
 SIDE_PX: Final = 12 * MARGIN_PX
 """Side of the picture of a closure."""
-REACH_M: Final = 15.0
+REACH_M: Final = 10.0 * CLOSURES_APART_M
 """Half of its side, or more for keyscans that are far apart: this remains around each."""
 DOT_PX: Final = 2
 

@@ -18,26 +18,26 @@ CELL_M: Final = 0.1
 """Least side of a cell of the search grid."""
 LARGEST_GRID: Final = 400_000
 """Cells of the search grid; in a larger map they are wider."""
-POCKET_M2: Final = 1.0
-"""Smaller areas are no place for a robot."""
 VIEW_M: Final = 5.0
 """Side of the square around a frontier whose unknown area counts as its gain."""
 GAIN_M_PER_M2: Final = 0.5
 """Metres of path that one square metre of unknown area is worth."""
-KEEPING_M: Final = 3.0
-"""Metres of path that another frontier must save before a robot turns to it."""
 SAME_M: Final = 1.0
 """Frontiers this near to each other in two moments are the same one. A robot that stands farther from a passable cell
 reaches nothing."""
+POCKET_M2: Final = SAME_M**2
+"""Smaller areas are no place for a robot."""
+KEEPING_M: Final = 3.0 * SAME_M
+"""Metres of path that another frontier must save before a robot turns to it."""
 REACHED_M: Final = 0.5 * SAME_M
 """A robot this near to a frontier sees what can be seen from there."""
-SHARING_M: Final = 20.0
+SHARING_M: Final = 4.0 * VIEW_M
 """Metres of path that a frontier costs more for each robot that goes there already."""
 UNREACHABLE: Final = 1e9
 """Cost of a frontier without a path, metres; more than any path."""
-MARGIN: Final = 3
-"""Unknown cells of the search grid on each side of the map."""
 NEIGHBOURS: Final = np.ones((3, 3), bool)
+MARGIN: Final = len(NEIGHBOURS)
+"""Unknown cells of the search grid on each side of the map."""
 
 Cells = NDArray[np.bool_]
 

@@ -27,8 +27,8 @@ GEOREFERENCE: Final = "_georeference.json"
 """End of the name of the file, beside a map, that says how the map lies on the earth."""
 FINEST_M: Final = 1e-4
 COARSEST_M: Final = 1e3
-FARTHEST_M: Final = 1e8
-"""Limits of a map's cells and origin."""
+FARTHEST_M: Final = 1e7
+"""Limits of a map's cells, and of its origin and poses: farther from the origin, floats do not resolve cells."""
 HEADER_BYTES: Final = 4096
 """Largest header of an image: longer comments are not read."""
 

@@ -29,7 +29,6 @@ _MODES: Final = ("trinary", "scale", "raw")
 _PGM: Final = re.compile(rb"P([25])(?:\s+|#[^\n]*\n)+\d+(?:\s+|#[^\n]*\n)+\d+(?:\s+|#[^\n]*\n)+([1-9]\d{0,4})\s")
 _MOST_PIXELS: Final = 1 << 28
 """Largest number of cells of a map that is turned: cells of 2.5 cm over 400 m."""
-_PERCENT: Final = 100
 _ROUNDING: Final = 1e-6
 """Share of a cell by which a map that is turned by a right angle may seem wider."""
 
@@ -127,7 +126,7 @@ def _occupancy(mode: str, negate: bool) -> NDArray[np.float64]:
     """Occupancy of a cell by grey value, shape (256,); NaN is unknown."""
     grey = np.arange(256.0)
     if mode == "raw":
-        return np.where(grey <= _PERCENT, grey / _PERCENT, np.nan)
+        return np.where(grey <= 100, grey / 100, np.nan)  # percent
     return grey / 255.0 if negate else 1.0 - grey / 255.0
 
 

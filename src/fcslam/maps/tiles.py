@@ -14,9 +14,9 @@ from fcslam.maps.occupancy_map import PIXELS, Occupancy, parse_image, pixels_of
 from fcslam.runs.folder import identity
 from fcslam.untrusted import read_bytes, read_text
 
-WORLD_M = 512.0
-"""Side of a tile at zoom 0; each zoom halves it."""
 TILE_PX = 512
+WORLD_M = 1.0 * TILE_PX
+"""Side of a tile at zoom 0, where a pixel is a metre; each zoom halves it."""
 DEEPEST_ZOOM = 8
 MAPS_KEPT = 4
 """Maps kept in memory, at most 85 MB each."""

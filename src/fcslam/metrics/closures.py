@@ -30,9 +30,9 @@ REACH_M: Final = 2.0
 """A closure finds a revisit if both ends are within this path length of it: the spacing of places."""
 WITHIN_GAP_S: Final = 60.0
 """Shortest time between two passes of one robot that count as a revisit."""
-EVERY_M: Final = 1.0
+EVERY_M: Final = 0.5 * REACH_M
 """Path length between the poses that are tested."""
-RADIUS_M: Final = 2.0
+RADIUS_M: Final = REACH_M
 """Largest distance of the other path."""
 
 

@@ -16,7 +16,7 @@ _WALLS, _FLOORS, _FRONTS = 8, 6, 10
 """Number of different walls, floors and furniture fronts. Every picture is unique."""
 _PICTURE_OFF_M = WALL_M / 2.0 + 0.01
 
-LAMP_HEIGHT_M = 2.4
+LAMP_HEIGHT_M = WALL_HEIGHT_M - 0.1
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ _CLEARANCE_M = ROBOT_RADIUS_M + 0.05
 """Smallest clearance of a path; the margin exceeds the rounding of the grid."""
 _COMFORT_M = 0.8
 """Clearance above which a metre has its plain cost of 1."""
-_CELL_M = 0.05
+CELL_M = 0.05
 """Side of a cell of the fine grid."""
 _STEP = 2
 """Cells between two points of the search grid."""
@@ -36,7 +36,7 @@ class DrivableSpace:
 
     def __init__(self, plan: FloorPlan) -> None:
         """Compute the drivable space of ``plan`` with its furniture."""
-        self._clearance_m = _CELL_M * distance_transform_edt(~obstacle_cells(plan))
+        self._clearance_m = CELL_M * distance_transform_edt(~obstacle_cells(plan))
         parts, count = label(self._clearance_m[::_STEP, ::_STEP] >= _CLEARANCE_M, np.ones((3, 3)))
         if not count:
             raise InputError(
@@ -44,7 +44,7 @@ class DrivableSpace:
             )
         self._inside: Cells = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
         rows, columns = np.nonzero(self._inside)
-        self.points: FloatArray = frozen((np.column_stack((columns, rows)) * _STEP + 0.5) * _CELL_M)
+        self.points: FloatArray = frozen((np.column_stack((columns, rows)) * _STEP + 0.5) * CELL_M)
         """Points (N, 2) of the search grid, 0.1 m apart, metres in ``building``."""
         self._nearby = KDTree(self.points)
 
@@ -67,9 +67,9 @@ class DrivableSpace:
     def leg_costs(self, start: FloatArray, ends: FloatArray) -> FloatArray:
         """Costs (M,) of straight legs from ``start`` (2,) to ``ends`` (M, 2); infinite if a robot would collide."""
         lengths = np.linalg.norm(ends - start, axis=1)
-        shares = np.linspace(0.0, 1.0, 2 + int(lengths.max(initial=0.0) / _CELL_M))
+        shares = np.linspace(0.0, 1.0, 2 + int(lengths.max(initial=0.0) / CELL_M))
         samples = start + shares[:, None, None] * (ends - start)
-        cells = (samples / _CELL_M - 0.5)[..., ::-1]
+        cells = (samples / CELL_M - 0.5)[..., ::-1]
         clearance_m = map_coordinates(self._clearance_m, cells.reshape(-1, 2).T, order=1, mode="nearest")
         clearance_m = clearance_m.reshape(len(shares), len(ends))
         costs = lengths * np.mean(_price(clearance_m), axis=0)
@@ -78,7 +78,7 @@ class DrivableSpace:
     def _straightened(self, path: FloatArray) -> FloatArray:
         """Remove corners from a path (K, 2) as long as the cost hardly grows; clearance counts as in the search."""
         steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-        clearance_m = map_coordinates(self._clearance_m, (path / _CELL_M - 0.5).T[::-1], order=1, mode="nearest")
+        clearance_m = map_coordinates(self._clearance_m, (path / CELL_M - 0.5).T[::-1], order=1, mode="nearest")
         price = _price(clearance_m)
         driven = np.insert(np.cumsum(steps), 0, 0.0)
         spent = np.insert(np.cumsum(steps * 0.5 * (price[1:] + price[:-1])), 0, 0.0)
@@ -95,7 +95,7 @@ class DrivableSpace:
     @cached_property
     def _graph(self) -> csr_array:
         """Costs (N, N) of the steps between neighbouring grid points, diagonal steps included."""
-        return cell_graph(self._inside, _STEP * _CELL_M, _price(self._clearance_m[::_STEP, ::_STEP]))
+        return cell_graph(self._inside, _STEP * CELL_M, _price(self._clearance_m[::_STEP, ::_STEP]))
 
 
 def _price(clearance_m: FloatArray) -> FloatArray:
@@ -105,17 +105,17 @@ def _price(clearance_m: FloatArray) -> FloatArray:
 
 def obstacle_cells(plan: FloorPlan) -> Cells:
     """Occupied cells, shape (H, W), row 0 in the south."""
-    width, height = (int(np.ceil(size / _CELL_M)) for size in plan.size_m)
+    width, height = (int(np.ceil(size / CELL_M)) for size in plan.size_m)
     occupied = np.zeros((height, width), dtype=bool)
-    reach = _CELL_M * np.sqrt(0.5)
+    reach = CELL_M * np.sqrt(0.5)
     for piece in plan.pieces:
         if piece.kind is PieceKind.LINTEL:
             continue
-        low = np.maximum(((piece.outline.min(axis=0) - reach) / _CELL_M).astype(int), 0)
-        high = ((piece.outline.max(axis=0) + reach) / _CELL_M).astype(int) + 1
+        low = np.maximum(((piece.outline.min(axis=0) - reach) / CELL_M).astype(int), 0)
+        high = ((piece.outline.max(axis=0) + reach) / CELL_M).astype(int) + 1
         block = occupied[low[1] : high[1], low[0] : high[0]]
         rows, columns = np.indices(block.shape)
-        centres = (np.stack((columns, rows), axis=-1) + low + 0.5) * _CELL_M
+        centres = (np.stack((columns, rows), axis=-1) + low + 0.5) * CELL_M
         block |= np.all(_outside_m(centres, piece.outline) < reach, axis=-1)
     return occupied
 

@@ -12,6 +12,7 @@ import fcslam
 from fcslam.config import dump
 from fcslam.errors import InputError, writing
 from fcslam.geometry import se2
+from fcslam.lab.simulation.drivable_space import CELL_M
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings
 from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.records import FloatArray, LaserModel, SensorRecord
@@ -26,7 +27,7 @@ GROUND_TRUTH: Final = "ground_truth.tum"
 
 Watch = Callable[[Iterator[SensorRecord]], Iterator[SensorRecord]]
 
-RESOLUTION_M = 0.05
+RESOLUTION_M = CELL_M
 
 _MARGIN = 2
 """Unknown cells around the building."""

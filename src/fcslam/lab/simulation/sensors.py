@@ -15,7 +15,7 @@ from fcslam.lab.simulation.textures import Image
 from fcslam.records import CameraModel, FloatArray, LaserModel
 
 LASER_HEIGHT_M = 0.25
-_UNSEEN = 5
+_UNSEEN = SEEN + 1
 """Group of geoms that are not drawn."""
 
 

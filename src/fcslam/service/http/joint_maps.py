@@ -15,8 +15,8 @@ from starlette.concurrency import run_in_threadpool
 
 from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.config import StrictModel
-from fcslam.lidar.occupancy import FARTHEST_M
 from fcslam.maps.joint_tiles import LARGEST_ANSWER
+from fcslam.maps.occupancy_map import FARTHEST_M
 from fcslam.records import NAME
 from fcslam.runs import QUALITY, Run, separations
 from fcslam.runs.folder import identity
