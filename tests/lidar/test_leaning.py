@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.lidar.facing import FacingWatch
+from fcslam.lidar.facing import watch_facing
 from fcslam.lidar.frontend import LidarConfig
 from fcslam.lidar.leaning import floor_line, wrong_laser
 from fcslam.metrics.trajectory import PositionErrors, align, position_errors
-from fcslam.records import LaserModel, frozen
+from fcslam.records import LaserModel, LaserScan, frozen
 from fcslam.robot.calibrating import calibrated
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source, write_bag
@@ -141,6 +141,7 @@ def test_a_log_names_the_beams_to_leave_out(tmp_path):
 def test_a_live_robot_is_told():
     poses = worlds.drive(3 * [(-3.0, -1.0), (1.5, -2.0), (3.2, 1.0), (-0.5, 2.0)], step_m=0.15)
     scans = worlds.recording(poses, poses, worlds.room(), LASER)
-    watch = FacingWatch()
-    (watched,) = (found for scan in with_floor(FloorLine(2.0, 0.0), scans) if (found := list(watch.add(scan))))
+    seen: list[LaserScan] = []
+    found = [watch_facing(seen, scan) for scan in with_floor(FloorLine(2.0, 0.0), scans)]
+    (watched,) = filter(len, found)
     assert "the laser leans and sees the floor: a line 2." in str(wrong_laser(watched))

@@ -17,22 +17,21 @@ from numpy.typing import NDArray
 from fcslam.geometry import se2
 from fcslam.records import FloatArray
 
-LEAST_TURN_RAD: Final = 0.15
 LEAST_MOVE_M: Final = 0.15
-"""Two scans are compared once the robot has turned or moved by so much."""
+LEAST_TURN_RAD: Final = LEAST_MOVE_M
+"""Two scans are compared once the robot has moved or turned by so much; the turn moves by as much what is at 1 m."""
 LONGEST_S: Final = 2.0
 """Scans farther apart in time are not compared: odometry drifts."""
-FEWEST_TURNS: Final = 20
-FEWEST_MOTIONS: Final = 30
-"""Fewer turns and motions say nothing about times and the mounting."""
+FEWEST_MOTIONS: Final = 20
+"""Fewer turns say nothing about times, and fewer motions nothing about the mounting."""
 FEWEST_PAIRS: Final = 4
 """Fewer turns or motions say nothing about the scales: two numbers are estimated from them."""
 LARGEST_RESIDUAL_M: Final = 0.1 * LEAST_MOVE_M
 """Motions of scans and odometry that differ by more, as a standard deviation, are not a measure of each other."""
 LARGEST_SIGMA: Final = 0.1
 """The same if the scale of distances is less certain, as a share of it: scans that were lost in a corridor."""
-LARGEST_DELAY_S: Final = 0.4
 DELAY_STEP_S: Final = 0.01
+LARGEST_DELAY_S: Final = 40 * DELAY_STEP_S
 """Range and step of the search for the delay, before it is refined."""
 HUBER: Final = 1.5
 """Residuals beyond this many standard deviations count less."""
@@ -126,7 +125,7 @@ def calibrate(motions: ScanMotions, odometry: OdometryTrack) -> MotionCalibratio
     scales = MotionCalibration(turn_scale=turn_scale, distance_scale=distance_scale)
     is_known = distance_scale.sigma <= LARGEST_SIGMA * distance_scale.value
     is_measure, is_long = is_known and residual_m <= LARGEST_RESIDUAL_M, len(pairs) >= FEWEST_MOTIONS
-    if turns < FEWEST_TURNS or (is_long and not is_measure):
+    if turns < FEWEST_MOTIONS or (is_long and not is_measure):
         return scales
     timed = replace(scales, delay=delay, sweep_share=_sweep_share(motions, odometry, delay.value))
     return replace(timed, mounting=mounting) if is_long else timed
@@ -178,7 +177,7 @@ def _sweep_share(motions: ScanMotions, odometry: OdometryTrack, delay_s: float) 
     stamps = motions.stamps[known] + delay_s
     by_odometry = odometry.at(stamps + motions.last_s[known])[:, 2] - odometry.at(stamps + motions.first_s[known])[:, 2]
     turning = np.abs(by_odometry) > 0.25 * LEAST_TURN_RAD
-    if np.count_nonzero(turning) < FEWEST_TURNS:
+    if np.count_nonzero(turning) < FEWEST_MOTIONS:
         return None
     (share,), covariance = _robust(by_odometry[turning, None], motions.turned_rad[known][turning])
     return Estimate(float(share), float(np.sqrt(covariance[0, 0])))

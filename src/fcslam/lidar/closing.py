@@ -29,13 +29,14 @@ DISTANCE_PENALTY = 0.2
 ANGLE_PENALTY = 0.5 * DISTANCE_PENALTY
 """Shares of a search's score that are lost at the edges of its window: of equal poses, the one near the prediction
 counts."""
-UNPACKED = 16
-"""Submaps that are kept ready for comparison, 0.2 MB each."""
 PENDING_M = 60.0
 """Travel after which a pending closure without enough support is dropped, metres."""
 
 BASE_DRIFT_M, BASE_DRIFT_RAD = 0.3, 0.05
 """Drift allowance at zero path length: the errors of the two submaps themselves."""
+DRIFT_M_M = 0.03
+DRIFT_RAD_M = 0.2 * DRIFT_M_M
+"""Drift of the position and the heading allowed for, per metre of path through the graph: metres, and radians."""
 ALIGNMENT_MARGIN_M, ALIGNMENT_MARGIN_RAD = BASE_DRIFT_M, 2.0 * BASE_DRIFT_RAD
 """The refined alignment may lie this far outside the search window."""
 CLOSURE_PATH_M = 1.0
@@ -49,10 +50,6 @@ MINIMUM_SUPPORT = 3.0
 """Sum of ``Verification.support`` that consistent pending closures need."""
 MINIMUM_SPREAD_M = MINIMUM_SUPPORT
 """Travel over which they are spread at least, a metre each: closures from one place are one piece of evidence."""
-LOOP_M, LOOP_PER_M = 0.25, 0.02
-"""Two closures are consistent if their loop closes to this many metres, plus so many per metre of path in it."""
-LOOP_RAD, LOOP_RAD_PER_M = BASE_DRIFT_RAD, 0.1 * LOOP_PER_M
-"""The same for the heading, in radians and radians per metre."""
 MOST_NEARBY, NEARBY_M = 10, 2.0
 """Most submaps in a square of the map, of this side in metres, that later ones are compared with; beyond, the oldest is
 forgotten."""
@@ -64,11 +61,10 @@ LEAST_GAP_M = 1.5 * SIGHT_M
 MOST_CANDIDATES = 4
 """Largest number of earlier visits that a submap is compared with; in a square with more than ``MOST_NEARBY``, one
 closure ties it to the well-known area."""
+UNPACKED = 4 * MOST_CANDIDATES
+"""Submaps that are kept ready for comparison, 0.2 MB each."""
 SIMILAR_PLACES = 6 * MOST_CANDIDATES
 """Most similar earlier submaps among which the places to compare are chosen."""
-DRIFT_M_M = 0.03
-DRIFT_RAD_M = 0.2 * DRIFT_M_M
-"""Drift of the position and the heading allowed for, per metre of path through the graph: metres, and radians."""
 WIDEST_M = 15.0
 """Largest half side of the search window, metres."""
 WIDEST_RAD = 0.7
@@ -183,17 +179,11 @@ class LoopCloser:
         paths: FloatArray = _shortest_paths(later, np.diff(self._travel), closures, CLOSURE_PATH_M)
         return paths
 
-    def _drift_allowance(self, path_m: ArrayLike) -> FloatArray:
-        """Error of the estimate allowed for after paths (...) through the graph: metres and radians, (..., 2)."""
-        path = np.asarray(path_m)[..., None]
-        allowed = np.array((BASE_DRIFT_M, BASE_DRIFT_RAD)) + np.array((DRIFT_M_M, DRIFT_RAD_M)) * path
-        return np.asarray(np.minimum((WIDEST_M, WIDEST_RAD), allowed))
-
     def _candidates(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
         """The nearest submap of each earlier visit to the neighbourhood, nearest visits first."""
         travel = self._travel
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
-        drift = self._drift_allowance(paths)[:, 0]
+        drift = drift_allowance(paths)[:, 0]
         near = (travel[later] - travel > LEAST_GAP_M) & (distance < SIGHT_M + drift)
         indices = np.flatnonzero(near & self._is_held())
         if not len(indices):
@@ -212,7 +202,7 @@ class LoopCloser:
         """
         a, b = self._submap(earlier), self._submap(later)
         guess = predicted = se2.between(anchors[earlier], anchors[later])
-        radius, angle = self._drift_allowance(path_m).tolist()
+        radius, angle = drift_allowance(path_m).tolist()
         if recognized is not None:
             guess = recognized
         elif radius > NARROW_M:
@@ -255,7 +245,7 @@ class LoopCloser:
     def _lookalikes(self, recognizer: PlaceRecognizer, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
         travel = self._travel
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
-        drift = self._drift_allowance(paths)
+        drift = drift_allowance(paths)
         capped = (drift >= (WIDEST_M, WIDEST_RAD)).any(axis=1)
         unsure = capped | (distance > SIGHT_M + drift[:, 0])
         possible = distance < SIGHT_M + RECOGNIZED_DRIFT * paths
@@ -293,6 +283,13 @@ class LoopCloser:
         return closure.check.strict and closure.check.informative and overlap > CONCLUSIVE_OVERLAP and near
 
 
+def drift_allowance(path_m: ArrayLike) -> FloatArray:
+    """Error of the estimate allowed for after paths (...) through the graph: metres and radians, (..., 2)."""
+    path = np.asarray(path_m)[..., None]
+    allowed = np.array((BASE_DRIFT_M, BASE_DRIFT_RAD)) + np.array((DRIFT_M_M, DRIFT_RAD_M)) * path
+    return np.asarray(np.minimum((WIDEST_M, WIDEST_RAD), allowed))
+
+
 def supported(pending: Sequence[LocalClosure], travel: FloatArray, anchors: FloatArray) -> list[LocalClosure]:
     """The closures that support each other enough to be accepted, whatever their order.
 
@@ -317,6 +314,8 @@ def supported(pending: Sequence[LocalClosure], travel: FloatArray, anchors: Floa
 def consistency(closures: Sequence[LocalClosure], travel: FloatArray, anchors: FloatArray) -> NDArray[np.bool_]:
     """Whether the loop over two closures and the estimated motions between their ends closes, shape (C, C).
 
+    It must close within the drift allowed for on the path in it.
+
     Arguments as for ``supported``.
     """
     ends = np.array([(c.earlier, c.later) for c in closures], dtype=np.int64).reshape(-1, 2)
@@ -328,11 +327,8 @@ def consistency(closures: Sequence[LocalClosure], travel: FloatArray, anchors: F
     residual = se2.between(earlier, round_trip)
     between_later_m = np.abs(np.subtract.outer(travel[ends[:, 1]], travel[ends[:, 1]]))
     path_m = between_later_m + np.hypot(earlier[..., 0], earlier[..., 1])
-    off_m, off_rad = np.hypot(residual[..., 0], residual[..., 1]), np.abs(residual[..., 2])
-    consistent: NDArray[np.bool_] = (off_m < LOOP_M + LOOP_PER_M * path_m) & (
-        off_rad < LOOP_RAD + LOOP_RAD_PER_M * path_m
-    )
-    return consistent
+    off = np.stack((np.hypot(residual[..., 0], residual[..., 1]), np.abs(residual[..., 2])), axis=-1)
+    return np.asarray((off < drift_allowance(path_m)).all(axis=-1))
 
 
 @njit

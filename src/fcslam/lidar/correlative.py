@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from fcslam.compiled import njit
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.scan import PointScan
-from fcslam.lidar.submap import FREE_CELL_M
+from fcslam.lidar.submap import FREE_CELL_M, RADIUS_M
 from fcslam.records import FloatArray
 
-MAXIMUM_REACH_M = 25.0
-"""Points farther than this do not enlarge the likelihood grid."""
 REACH_QUANTILE = 0.9
 """The angle step moves a point at this quantile of the distances by one cell."""
 CELL_M = FREE_CELL_M
@@ -106,7 +104,7 @@ def search(
     cell_m = window.cell_m
     thinned = scan.thinned(cell_m, MOST_POINTS)
     reach = float(np.max(np.hypot(*thinned.points.T), initial=1.0))
-    half_side = min(reach, MAXIMUM_REACH_M) + window.radius_m + cell_m
+    half_side = min(reach, RADIUS_M) + window.radius_m + cell_m
     usable = int(np.log2(window.radius_m / cell_m + 1.0)) + 1  # the levels that the window can use
     levels = min(MOST_LEVELS, max(1, usable))
     pyramid = likelihood_pyramid(field, T_field_guess, half_side, visible_only, levels, cell_m, window.smear_m)

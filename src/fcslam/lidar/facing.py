@@ -22,12 +22,12 @@ from fcslam.records import FloatArray, LaserScan
 
 LONGEST_S: Final = 2.0 * calibration.LONGEST_S
 """Scans farther apart in time are not compared: odometry drifts."""
-MOST_COMPARED: Final = 3000
-"""Scans that are read at most."""
-MOST_PAIRS: Final = 40
-"""Pairs with a move that are compared, and as many with a turn."""
 SCANS_WATCHED: Final = 60
 """Scans of a live laser that are compared."""
+MOST_COMPARED: Final = 50 * SCANS_WATCHED
+"""Scans of a recording that are read at most: most are too near to the one before."""
+MOST_PAIRS: Final = SCANS_WATCHED
+"""Pairs with a move that are compared, and as many with a turn."""
 FEWEST_PAIRS: Final = 5
 """Fewer pairs say nothing."""
 ENOUGH_PAIRS: Final = 2 * FEWEST_PAIRS
@@ -45,7 +45,7 @@ ENOUGH_AGREEMENT: Final = 0.75
 """Agreement with which a mounting is right."""
 LEAST_AGREEMENT: Final = 0.6
 """Least agreement with the right mounting; below, the scans do not fit the odometry in any way."""
-NO_AGREEMENT: Final = 0.4
+NO_AGREEMENT: Final = 1.0 - LEAST_AGREEMENT
 """Scans agree less with the stated mounting only if something is wrong."""
 LEAST_GAIN: Final = 0.1
 """Least gain in agreement over the stated mounting."""
@@ -53,7 +53,7 @@ LEAST_LEAD: Final = 0.5 * LEAST_GAIN
 """Least gain in agreement over any other mounting."""
 SIGMAS: Final = 5.0
 """Least ratio of the gain to its standard deviation."""
-CLEAR_LEAD: Final = 0.15
+CLEAR_LEAD: Final = 3.0 * LEAST_LEAD
 """A right mounting with this gain is certain, too: a short drive has too few pairs for the deviation."""
 
 
@@ -155,18 +155,12 @@ def part_agreement(scans: Iterable[LaserScan], part: Callable[[LaserScan], Laser
     return float(found.mean()) if len(found) >= FEWEST_PAIRS else math.nan
 
 
-class FacingWatch:
-    """Collects scans of a live laser that tell how it faces."""
-
-    def __init__(self) -> None:
-        self._scans: list[LaserScan] = []
-
-    def add(self, scan: LaserScan) -> Sequence[LaserScan]:
-        """Add the next scan of the laser; returns the scans once, when its robot has moved enough."""
-        if len(self._scans) == SCANS_WATCHED or (self._scans and not any(_moved(self._scans[-1], scan))):
-            return ()
-        self._scans.append(scan)
-        return self._scans if len(self._scans) == SCANS_WATCHED else ()
+def watch_facing(watched: list[LaserScan], scan: LaserScan) -> Sequence[LaserScan]:
+    """Add the next scan of a live laser to those that tell how it faces; returns them once, when they are enough."""
+    if len(watched) == SCANS_WATCHED or (watched and not any(_moved(watched[-1], scan))):
+        return ()
+    watched.append(scan)
+    return watched if len(watched) == SCANS_WATCHED else ()
 
 
 class _Trial:
@@ -261,7 +255,7 @@ def _points(scan: LaserScan, T_base_laser: FloatArray, upside_down: bool) -> tup
     laser = scan.laser
     is_return = (scan.ranges_m > 0.0) & (scan.ranges_m < laser.max_range_m)
     ranges_m = np.where(is_return, scan.ranges_m, laser.max_range_m).astype(np.float64)
-    directions = rays_of(replace(laser, T_base_laser=(0.0, 0.0, 0.0))).directions
+    _, directions = rays_of(replace(laser, T_base_laser=(0.0, 0.0, 0.0)))
     points = ranges_m[:, None] * directions * (1.0, -1.0 if upside_down else 1.0)
     if scan.sweep is None:
         return points, is_return

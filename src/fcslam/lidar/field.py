@@ -27,6 +27,8 @@ MEAN_OVER: Final = 30.0
 """A surfel is a running mean over this many returns, so it can follow its surface."""
 TABLE: Final = 512
 """Tiles along one side of the field: 409.6 m, more than any submap with any laser."""
+WIDEST_M: Final = TABLE * TILE * CELL_M - 2.0
+"""Largest extent in x or y of a map that becomes a field."""
 EMPTY: Final = -1
 MERGED: Final = 4
 """Columns of a surfel that later ones serve to merge returns."""
@@ -36,7 +38,7 @@ MOST_SURFELS: Final = int(np.iinfo(np.int16).max)
 """Largest number of labels: 1.6 km of walls. Later returns are merged into surfels or left out."""
 TOO_MANY_WALLS: Final = f"has too many walls; at most {1e-3 * MERGE_M * MOST_SURFELS:.1f} km can be used"
 
-MOST_NEW_TILES: Final = 9
+MOST_NEW_TILES: Final = (2 * math.ceil(REACH_M / (TILE * CELL_M)) + 1) ** 2
 """Largest number of tiles within reach of one surfel."""
 
 _REACH_CELLS = round(REACH_M / CELL_M)

@@ -15,13 +15,12 @@ from fcslam.geometry import se2
 from fcslam.lidar.odometry import OdometryModel
 from fcslam.lidar.tracker import ScanTracker
 from fcslam.records import LaserScan, Sweep, frozen
+from fcslam.sources.contradictions import STILL_M, STILL_RAD
 
 LONGEST_GAP_S: Final = 1.0
 """A scan after a longer gap says nothing about the motion during the one before it, nor the reverse."""
 PASSES: Final = 8
 """Most matches of the two scans."""
-SAME: Final = 1e-3
-"""Motions that differ by less are the same, metres and radians."""
 SIGMAS: Final = 3.0
 """A motion that the points show less clearly, in standard deviations, may be none."""
 
@@ -50,6 +49,6 @@ def first_sweep(first: LaserScan, second: LaserScan, odometry: OdometryModel) ->
         x, y, theta = (se2.log(T_first_second) / elapsed_s).tolist()
         sweep = sweep._replace(velocity=(x, y, theta))
         dx, dy, turn = se2.motion(before, T_first_second)
-        if math.hypot(dx, dy) < SAME and abs(turn) < SAME:
+        if math.hypot(dx, dy) < STILL_M and abs(turn) < STILL_RAD:
             break
     return sweep

@@ -15,10 +15,10 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
+from fcslam.geometry.beams import is_same_laser
 from fcslam.lidar.evidence import CORRELATED, SIGMA_PER_TURN
 from fcslam.lidar.information import limited_information
 from fcslam.lidar.karto import KartoTracker
-from fcslam.lidar.lasers import Lasers
 from fcslam.lidar.odometry import WHEELS, OdometryModel, OdometryTrust, odometry_error
 from fcslam.lidar.own_body import Polygon, Sectors
 from fcslam.lidar.scan import PointScan, point_scan
@@ -45,7 +45,8 @@ SUBMAP_REACH_M = 5.0
 """Travel before and after its anchor that a submap covers."""
 POINT_INFORMATION_SHARE = 1.0 / CORRELATED
 """Share of the points' information that counts: errors of neighbouring points are correlated."""
-ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_RAD = 0.01, 0.005
+ODOMETRY_SIGMA_M = 0.01
+ODOMETRY_SIGMA_RAD = 0.5 * ODOMETRY_SIGMA_M
 """Constant part of the standard deviations of odometry between two keyscans that were matched, in metres and radians;
 ``SIGMA_PER_TURN`` of the travel and the turn comes on top. It fixes what the points leave open, as along a corridor. It
 is smaller than in the tracker (``OdometryModel``): the match has shown that the wheels did not slip."""
@@ -141,7 +142,8 @@ class LidarFrontend:
         self.config = config
         self.odometry = odometry
         self._tracker = _tracker(config, odometry)
-        self._lasers = Lasers()
+        self._lasers: list[LaserModel] = []
+        """Each with the beams of its first scan."""
         self._count = 0
         self._newest: MappedKeyscan | None = None
         self._T_local_newest: dict[int, FloatArray] = {}
@@ -166,14 +168,14 @@ class LidarFrontend:
         self._tracker.commit(tracking)
         tracked = tracking.tracked
         # 2. After enough motion the scan becomes a keyscan.
-        laser = self._lasers.index(scan.laser)
+        laser = laser_index(self._lasers, scan.laser)
         keyscan = self._add_keyscan(scan, tracked, laser) if self._is_keyscan(tracked, laser) else None
         return Step(self.scan_pose(scan.stamp, tracked), keyscan)
 
     @property
     def lasers(self) -> tuple[LaserModel, ...]:
         """The lasers whose scans were processed; keyscans name theirs by its index."""
-        return self._lasers.known
+        return tuple(self._lasers)
 
     @property
     def travel_m(self) -> float:
@@ -256,6 +258,18 @@ class LidarFrontend:
         )
         progress = float(np.hypot(motion[0], motion[1])) + TURN_AS_TRAVEL_M * abs(float(motion[2]))
         return constraint, self._newest.travel_m + progress
+
+
+def laser_index(known: list[LaserModel], laser: LaserModel) -> int:
+    """Index of the laser of a scan among those of its robot, by its mounting and its beams; an unknown one is added.
+
+    The beams of one laser may vary from scan to scan.
+    """
+    for index, other in enumerate(known):
+        if is_same_laser(laser, other):
+            return index
+    known.append(laser)
+    return len(known) - 1
 
 
 def _tracker(config: LidarConfig, odometry: OdometryModel) -> ScanTracker:

@@ -5,10 +5,10 @@ may come from any program; nothing but its cells counts.
 """
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import binary_dilation, gaussian_filter
 
 from fcslam.errors import SourceError
-from fcslam.lidar.field import CELL_M, TABLE, TILE, TOO_MANY_WALLS, SurfelField
+from fcslam.lidar.field import TOO_MANY_WALLS, WIDEST_M, SurfelField
 from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
@@ -16,10 +16,6 @@ from fcslam.records import FloatArray
 
 NORMAL_M = FREE_CELL_M
 """Width of the Gaussian over free cells whose slope is the normal of a wall."""
-ADJACENT_CELLS = 1.5
-"""An occupied cell is part of a surface if a free cell is this near, in cells; what lies behind it is never seen."""
-WIDEST_M = TABLE * TILE * CELL_M - 2.0
-"""Largest extent of a map in x or y."""
 FINEST_M, COARSEST_M = 0.002, 0.25
 """Smallest and largest side of a cell."""
 
@@ -46,7 +42,8 @@ def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
 
 def _surface(occupancy: OccupancyMap) -> PointScan:
     free = occupancy.cells == Occupancy.FREE
-    beside = (occupancy.cells == Occupancy.OCCUPIED) & (distance_transform_edt(~free) <= ADJACENT_CELLS)
+    # What lies behind a cell without a free neighbour is never seen.
+    beside = (occupancy.cells == Occupancy.OCCUPIED) & binary_dilation(free, np.ones((3, 3), np.bool_))
     rows, columns = np.nonzero(beside)
     slope = np.gradient(gaussian_filter(free.astype(np.float32), NORMAL_M / occupancy.resolution_m))
     normals = np.stack((slope[1][rows, columns], slope[0][rows, columns]), axis=1).astype(np.float64)

@@ -20,30 +20,27 @@ from fcslam.lidar.facing import SCANS_WATCHED, Contradiction, contradicted_facin
 from fcslam.lidar.own_body import MOST_PLACES, by_degree, scans_apart
 from fcslam.lidar.scan import rays_of
 from fcslam.records import FloatArray, LaserScan, frozen
+from fcslam.sources.point_clouds import LARGEST_BODY_M
 from fcslam.sources.returns import FloorLine
 
 FEWEST_PLACES: Final = SCANS_WATCHED
 HALF_DEG: Final = 35
 """Half of the sector that must see the line; a circle differs from a line by a fifth there."""
-STEP_DEG: Final = 5
-"""Between the directions that are tried."""
 LEAST_RETURNS: Final = 0.3
 """Share of the scans that have a return in each degree of the sector."""
-FARTHEST_SHARE: Final = 0.97
-"""Share of the ranges of a degree up to its end."""
 SAME: Final = 0.06
 """Largest deviation from the line, as a share of its distance: robots nod."""
 LEAST_STRAIGHT, LEAST_AT, MOST_BEYOND = 0.9, 0.12, 0.02
 """Shares: of the degrees that end at the line, of the returns there, and of those farther than ``BEYOND`` of it."""
 BEYOND: Final = 1.0 + 2.0 * SAME
-LEAST_M: Final = 1.0
-"""What is nearer is the robot's body."""
+FARTHEST_SHARE: Final = 1.0 - MOST_BEYOND
+"""Share of the ranges of a degree up to its end."""
 MOVING: Final = 0.3
 """Largest agreement of a line that moves with the robot; a wall keeps its place, also in a lane or a round building."""
 
 
 def wrong_laser(scans: Sequence[LaserScan]) -> FloorLine | Contradiction | None:
-    """What is wrong with how a laser is mounted, by the scans of a ``FacingWatch``."""
+    """What is wrong with how a laser is mounted, by the scans of ``watch_facing``."""
     return floor_line(scans) or contradicted_facing(scans)
 
 
@@ -55,7 +52,8 @@ def floor_line(scans: Sequence[LaserScan]) -> FloorLine | None:
 
 def _at_line(line: FloorLine, scan: LaserScan) -> LaserScan:
     heading_rad = line.heading_rad + scan.laser.T_base_laser[2]
-    ahead = rays_of(scan.laser).directions @ (math.cos(heading_rad), math.sin(heading_rad))
+    _, directions = rays_of(scan.laser)
+    ahead = directions @ (math.cos(heading_rad), math.sin(heading_rad))
     away = scan.ranges_m * ahead / line.distance_m
     return replace(scan, ranges_m=frozen(np.where(np.abs(away - 1.0) < SAME, scan.ranges_m, np.nan), np.float32))
 
@@ -70,7 +68,7 @@ def _line_ahead(scans: Iterable[LaserScan]) -> FloorLine | None:
     ends_m = np.full(360, np.nan)
     ends_m[is_seen] = np.nanquantile(ranges_m[:, is_seen], FARTHEST_SHARE, axis=0)
     found = []
-    for middle in range(0, 360, STEP_DEG):
+    for middle in range(360):
         offsets = np.arange(-HALF_DEG, HALF_DEG)
         offsets = offsets[is_seen[(middle + offsets) % 360]]
         if len(offsets) < HALF_DEG:
@@ -78,7 +76,7 @@ def _line_ahead(scans: Iterable[LaserScan]) -> FloorLine | None:
         sector, cosines = (middle + offsets) % 360, np.cos(np.radians(offsets + 0.5))
         distance_m = float(np.median(ends_m[sector] * cosines))
         on_line = np.abs(ends_m[sector] * cosines - distance_m) < SAME * distance_m
-        if distance_m < LEAST_M or on_line.mean() < LEAST_STRAIGHT:
+        if distance_m < LARGEST_BODY_M or on_line.mean() < LEAST_STRAIGHT:
             continue
         away = ranges_m[:, sector] * cosines / distance_m
         away = away[np.isfinite(away)]

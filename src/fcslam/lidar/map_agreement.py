@@ -32,12 +32,13 @@ from fcslam.records import FloatArray
 
 STRETCH_M: Final = 0.5
 """Length of a stretch of wall: one independent measurement."""
-FEWEST_POINTS: Final = 3
-"""Least points of a stretch; points are ``SPACING_M`` apart."""
+FEWEST_POINTS: Final = 0.5 * STRETCH_M / SPACING_M
+"""Least points of a stretch: half of it is known."""
 SAME_M, OTHER_M = 0.004, 0.03
 """Standard deviations of an offset, beyond the noise, in the same place and in another that looks alike, by comparisons
 of recorded logs and of drives in published floors."""
-MOVED, MOST_MOVED, UNLIKE = 0.1, 0.3, 0.4
+MOVED, UNLIKE = 0.1, 0.4
+MOST_MOVED: Final = 3.0 * MOVED
 """Shares of stretches whose offset is arbitrary: furniture that moved, at least and at most, and walls of another
 place."""
 IN_FREE, IN_FREE_ELSEWHERE = 0.02, 0.11
@@ -108,13 +109,13 @@ def local_map(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float) ->
     middle = len(scans) // 2
     whole, first, second = (build_submap(part, radius_m) for part in (scans, scans[:middle], scans[middle:]))
     compared = [_stretches(first, second, np.zeros(3)), _stretches(second, first, np.zeros(3))]
-    offsets_m: FloatArray = np.concatenate([each.offsets_m for each in compared])
-    in_free = max(each.in_free / max(1, each.in_free + len(each.offsets_m)) for each in compared)
+    offsets_m: FloatArray = np.concatenate([offsets_m for offsets_m, _, _ in compared])
+    in_free = max(count / max(1, count + len(offsets_m)) for offsets_m, count, _ in compared)
     halves = ((first, scans[:middle]), (second, scans[middle:]))
     contradicting_m = sum(
-        _length_m(half.surface.points[each.deep & ~seen_through(half, part)])
-        for each, (half, part) in zip(compared, halves, strict=True)
-        if each.deep.any()
+        _length_m(half.surface.points[deep & ~seen_through(half, part)])
+        for (_, _, deep), (half, part) in zip(compared, halves, strict=True)
+        if deep.any()
     )
     return LocalSubmap(whole, offsets_m, ~seen_through(whole, scans), in_free, contradicting_m)
 
@@ -143,11 +144,11 @@ def compare(a: LocalSubmap, b: LocalSubmap, T_a_b: FloatArray, noise: Noise) -> 
     mean = (1.0 - in_free) * (_expected_ratio(noise) + on_wall) + in_free * inside
     found = []
     for query, target, T in ((b, a, T_a_b), (a, b, se2.inverse(T_a_b))):
-        stretches = _stretches(query.submap, target.submap, T)
-        count = len(stretches.offsets_m) + stretches.in_free
-        ratios = _log_ratio(stretches.offsets_m, noise) + on_wall
-        support = float(ratios.sum() + stretches.in_free * inside)
-        against_m = _length_m(query.submap.surface.points[stretches.deep & query.is_solid])
+        offsets_m, free, deep = _stretches(query.submap, target.submap, T)
+        count = len(offsets_m) + free
+        ratios = _log_ratio(offsets_m, noise) + on_wall
+        support = float(ratios.sum() + free * inside)
+        against_m = _length_m(query.submap.surface.points[deep & query.is_solid])
         excess_m = against_m - noise.contradiction * STRETCH_M * count
         found.append(PlaceAgreement(support, count * mean, STRETCH_M * count, excess_m))
     return total(found)
@@ -169,22 +170,17 @@ def _expected_ratio(noise: Noise) -> float:
     return float((weights * _log_ratio(offsets_m, noise)).sum() / weights.sum())
 
 
-class _Stretches(NamedTuple):
-    offsets_m: FloatArray
-    """Of those on a wall, along its normal, shape (K,)."""
-    in_free: int
-    """How many lie in free space."""
-    deep: NDArray[np.bool_]
-    """Points of the map in free space, farther than the reach of the other's walls, shape (N,)."""
+def _stretches(query: Submap, target: Submap, T_target_query: FloatArray) -> tuple[FloatArray, int, NDArray[np.bool_]]:
+    """Offsets of the stretches on a wall, along its normal, shape (K,), and how many stretches lie in free space.
 
-
-def _stretches(query: Submap, target: Submap, T_target_query: FloatArray) -> _Stretches:
+    And which points of the map are in free space, farther than the reach of the other's walls, shape (N,).
+    """
     points, normals = query.surface.points, query.surface.normals
     field, free = target.field.arrays, target.free
     offsets_m, states = _offsets(points, normals, T_target_query, field, free.cells, free.corner)
     known = states != _UNKNOWN
     if not known.any():
-        return _Stretches(np.empty(0), 0, known)
+        return np.empty(0), 0, known
     cells = np.floor(points[known] / STRETCH_M).astype(np.int64)
     facing = np.round(np.arctan2(normals[known, 1], normals[known, 0]) / (0.5 * np.pi)).astype(np.int64) % 4
     _, number = np.unique(np.column_stack((cells, facing)), axis=0, return_inverse=True)
@@ -194,7 +190,7 @@ def _stretches(query: Submap, target: Submap, T_target_query: FloatArray) -> _St
     sums_m = np.bincount(number, weights=np.where(on_wall, offsets_m[known], 0.0))
     is_wall, is_free = walls >= FEWEST_POINTS, (counts >= FEWEST_POINTS) & (2.0 * walls < counts)
     in_free = int(np.count_nonzero(is_free & ~is_wall))
-    return _Stretches(sums_m[is_wall] / walls[is_wall], in_free, states == _DEEP_IN_FREE)
+    return sums_m[is_wall] / walls[is_wall], in_free, states == _DEEP_IN_FREE
 
 
 def _length_m(points: FloatArray) -> float:

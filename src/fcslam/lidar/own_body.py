@@ -24,8 +24,6 @@ from fcslam.sources.point_clouds import LARGEST_BODY_M
 Heading = Annotated[float, Field(ge=-360.0, le=360.0)]
 Sectors = tuple[tuple[Heading, Heading], ...]
 Metres = Annotated[float, Field(ge=-20.0, le=20.0)]
-LEAST_AREA_M2: Final = 1e-4
-"""A smaller polygon has no inside."""
 HOW_TO_GIVE: Final = "give corners [[x, y], ...] in the order of the outline"
 
 
@@ -39,7 +37,7 @@ def _as_list(corners: object) -> object:
 
 def _is_polygon(corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
     twice_area = sum(x1 * y2 - x2 * y1 for (x1, y1), (x2, y2) in _sides(corners))
-    if corners and abs(twice_area) < 2.0 * LEAST_AREA_M2:  # also of fewer than three corners
+    if corners and math.isclose(twice_area, 0.0, abs_tol=SAME_M**2):  # also of fewer than three corners
         raise ValueError(f"no polygon, as it has no inside: {HOW_TO_GIVE}")
     return corners
 
@@ -55,7 +53,8 @@ Polygon = Annotated[
 
 LEAST_MOVE_M, LEAST_TURN_RAD = 2.0 * calibration.LEAST_MOVE_M, 2.0 * calibration.LEAST_TURN_RAD
 """The robot has moved or turned by so much between two scans that are compared."""
-FEWEST_PLACES, MOST_PLACES = 20, 200
+FEWEST_PLACES = 20
+MOST_PLACES = 10 * FEWEST_PLACES
 SAME_M, STEADY = 0.05, 0.95
 """Largest deviation of a return of the robot from its usual range, and share of the places at which it has it."""
 MARGIN_DEG = 1

@@ -31,7 +31,7 @@ AHEAD: Final = 2
 """Batches that a process has at a time: it begins the next one while the result of the last one travels."""
 PATIENCE_S: Final = 10.0
 """A batch is repeated after this time."""
-REST_S: Final = 5.0
+REST_S: Final = 0.5 * PATIENCE_S
 """A process that failed gets no batch for so long."""
 SUBMAPS_KEPT: Final = 1000
 """Submaps that another process keeps, 0.2 MB each; the least recently used ones are dropped first."""
@@ -172,7 +172,7 @@ class VerificationPool:
             return None
         if isinstance(answer, bytes):
             self.answers += 1
-            return [_aligned(row) for row in np.frombuffer(answer).reshape(-1, _COLUMNS[-1]).copy()]
+            return [_aligned(row) for row in np.frombuffer(answer).reshape(-1, _WIDTH).copy()]
         peer.sent.difference_update(answer)
         return None
 
@@ -221,8 +221,9 @@ def align_batch(names: Sequence[bytes], new: Mapping[bytes, bytes], rows: bytes)
     return np.array([_row(found) for found in _aligned_here(pairs)]).tobytes()
 
 
-_COLUMNS: Final = (3, 12, 16, 25, 28)
-"""Ends of the columns of the parts of a row."""
+_ENDS: Final = np.cumsum([3, 3 * 3, 4, 3 * 3])
+"""Where the parts of a row end: transform, information, shares and normal tensor; then follows the gap."""
+_WIDTH: Final = int(_ENDS[-1]) + 3
 
 
 def _row(found: Aligned) -> FloatArray:
@@ -234,6 +235,6 @@ def _row(found: Aligned) -> FloatArray:
 
 
 def _aligned(row: FloatArray) -> Aligned:
-    T_a_b, information, (explained, violation, count, overlap), tensor, gap, _ = np.split(row, _COLUMNS)
+    T_a_b, information, (explained, violation, count, overlap), tensor, gap = np.split(row, _ENDS)
     worse = Agreement(float(explained), float(violation), int(count), float(overlap), tensor.reshape(3, 3))
     return Aligned(T_a_b, information.reshape(3, 3), worse, gap)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,21 +86,15 @@ def keyscan_points(keyscan: Keyscan, lasers: Sequence[LaserModel]) -> PointScan:
     return point_scan(keyscan.ranges_m, keyscan.laser_model(lasers), keyscan.sweep)
 
 
-class Rays(NamedTuple):
-    """The beams of a scan in ``base`` at its stamp: a return lies at ``origin + range * direction``."""
+def rays_of(laser: LaserModel, sweep: Sweep | None = None) -> tuple[FloatArray, FloatArray]:
+    """Origins and directions of the beams of a scan in ``base`` at its stamp, shape (beam_count, 2) each.
 
-    origins: FloatArray
-    """Where the laser was at each beam, shape (beam_count, 2), metres."""
-    directions: FloatArray
-    """Unit vectors, shape (beam_count, 2)."""
-
-
-def rays_of(laser: LaserModel, sweep: Sweep | None = None) -> Rays:
-    """The beams of a scan of ``laser``, as ``point_scan`` places its returns on them."""
+    A return lies at ``origin + range * direction``, where ``point_scan`` places it.
+    """
     if sweep is None:
         return _rays(laser)
     origins, directions, _ = _swept(*_rays(laser), sweep)
-    return Rays(origins, directions)
+    return origins, directions
 
 
 def beam_times(laser: LaserModel, sweep: Sweep) -> FloatArray:
@@ -109,11 +103,11 @@ def beam_times(laser: LaserModel, sweep: Sweep) -> FloatArray:
 
 
 @lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan
-def _rays(laser: LaserModel) -> Rays:
+def _rays(laser: LaserModel) -> tuple[FloatArray, FloatArray]:
     """The beams if all are measured at the stamp. Only here and in ``_swept`` beams get positions and directions."""
     angles = laser.angles_rad() + laser.T_base_laser[2]
     origins = np.tile(laser.T_base_laser[:2], (laser.beam_count, 1))
-    return Rays(origins, np.stack((np.cos(angles), np.sin(angles)), axis=1))
+    return origins, np.stack((np.cos(angles), np.sin(angles)), axis=1)
 
 
 @njit

@@ -117,19 +117,13 @@ def is_elsewhere(one: FloatArray, other: FloatArray, middle: FloatArray) -> bool
     return bool(np.linalg.norm(gap) > ELSEWHERE_M or turn > ELSEWHERE_RAD)
 
 
-@dataclass(frozen=True, slots=True)
-class _Drawing:
-    """A map as points around the middle of its surface, metres."""
-
-    surface: FloatArray  # (N, 2)
-    inside: FloatArray  # (M, 2): centres of the free cells well away from any surface
-    middle: FloatArray  # (2,), in the map's own coordinates
-    reach_m: float  # distance of the farthest of these points
-    low: FloatArray  # (2,)
-    high: FloatArray  # (2,)
+Drawing = tuple[FloatArray, FloatArray]
+"""A map as points around the middle of its surface, metres: its surface, shape (N, 2), and the centres of its free
+cells well away from any surface, shape (M, 2)."""
 
 
-def _drawing(submap: Submap) -> _Drawing:
+def _drawing(submap: Submap) -> tuple[Drawing, FloatArray]:
+    """The drawing of a map, and its middle (2,) in the map's own coordinates."""
     free, points = submap.free, submap.surface.points
     surface = np.zeros_like(free.cells)
     column, row = np.floor((points - free.corner) / FREE_CELL_M).astype(np.int64).T
@@ -138,9 +132,7 @@ def _drawing(submap: Submap) -> _Drawing:
     rows, columns = np.nonzero(free.cells & away)
     middle = points.mean(axis=0)
     inside = (np.column_stack((columns, rows)) + 0.5) * FREE_CELL_M + free.corner - middle
-    drawn = np.concatenate((points - middle, inside))
-    reach_m = float(np.hypot(*drawn.T).max())
-    return _Drawing(points - middle, inside, middle, reach_m, drawn.min(axis=0), drawn.max(axis=0))
+    return (points - middle, inside), middle
 
 
 def _coarse_peaks(a: Submap, b: Submap, headings: FloatArray | None = None) -> FloatArray:
@@ -149,15 +141,17 @@ def _coarse_peaks(a: Submap, b: Submap, headings: FloatArray | None = None) -> F
     The score is a correlation of images: a cell of surface of one map counts by the cell of the other that it lies on,
     1 on a surface, blurred, and -``VIOLATION_WEIGHT`` in free space.
     """
-    one, other = _drawing(a), _drawing(b)
+    (one, middle_a), (other, middle_b) = _drawing(a), _drawing(b)
+    drawn_a, reach_b_m = np.concatenate(one), float(np.hypot(*np.concatenate(other).T).max())
     # Every shift of b at which the images touch has a cell of its own, at its number modulo the sides of the image.
-    least, most = np.floor((one.low - other.reach_m) / CELL_M), np.ceil((one.high + other.reach_m) / CELL_M)
+    least = np.floor((drawn_a.min(axis=0) - reach_b_m) / CELL_M)
+    most = np.ceil((drawn_a.max(axis=0) + reach_b_m) / CELL_M)
     columns, rows = (fft.next_fast_len(int(extent) + 2, real=True) for extent in most - least)
     surface_a, inside_a = _spectra(one, 0.0, (rows, columns))
     worth = 2.0 * surface_a * _smear(rows, columns) - VIOLATION_WEIGHT * inside_a  # a surface counts for both maps
     against, product, near = VIOLATION_WEIGHT * surface_a, np.empty_like(surface_a), np.arange(-4, 5)
     found: list[tuple[float, float, int, int]] = []
-    for heading in _half_headings(other) if headings is None else headings:
+    for heading in _half_headings(other[0]) if headings is None else headings:
         surface_b, inside_b = _spectra(other, heading, (rows, columns))
         for half in (0, 1):
             _correlate(worth, against, surface_b, inside_b, half == 1, product)
@@ -168,8 +162,8 @@ def _coarse_peaks(a: Submap, b: Submap, headings: FloatArray | None = None) -> F
                 scores[((row + near) % rows)[:, None], (column + near) % columns] = -np.inf
     score, heading_a_b, *cell = np.array(found).T
     shift = least + (np.column_stack(cell) - least) % (columns, rows)
-    T_middle = np.column_stack((CELL_M * shift + one.middle, heading_a_b))
-    return se2.compose(T_middle, np.append(-other.middle, 0.0))[np.argsort(-score, kind="stable")]
+    T_middle = np.column_stack((CELL_M * shift + middle_a, heading_a_b))
+    return se2.compose(T_middle, np.append(-middle_b, 0.0))[np.argsort(-score, kind="stable")]
 
 
 @njit(allocates=False)
@@ -186,9 +180,9 @@ def _correlate(worth, against, surface, inside, half, product):  # type: ignore[
             product[row, k] = worth[row, k] * s - against[row, k] * i
 
 
-def _half_headings(drawing: _Drawing) -> FloatArray:
+def _half_headings(surface: FloatArray) -> FloatArray:
     """Headings over half a turn at which the far walls of a map move by a cell and a half."""
-    lever_m = float(np.quantile(np.hypot(*drawing.surface.T), 0.9))
+    lever_m = float(np.quantile(np.hypot(*surface.T), 0.9))
     count = max(18, int(np.ceil(np.pi * lever_m / (1.5 * CELL_M))))
     return np.asarray(np.arange(count) * (np.pi / count), np.float64)
 
@@ -200,14 +194,14 @@ def _smear(rows: int, columns: int) -> NDArray[np.float32]:
     return spectrum * np.float32(np.sqrt(2.0 * np.pi))
 
 
-def _spectra(drawing: _Drawing, heading: float, shape: tuple[int, int]) -> tuple[Spectrum, Spectrum]:
+def _spectra(drawing: Drawing, heading: float, shape: tuple[int, int]) -> tuple[Spectrum, Spectrum]:
     """Spectra of a turned map: of the cells with a surface, and of the free cells well away from any.
 
     Single precision is enough for peaks that are refined later, and takes two thirds of the time.
     """
     surface, inside = np.zeros((2, *shape), np.float32)
-    _draw(drawing.surface, heading, surface)
-    _draw(drawing.inside, heading, inside)
+    for points, image in zip(drawing, (surface, inside), strict=True):
+        _draw(points, heading, image)
     return fft.rfft2(surface), fft.rfft2(inside)
 
 

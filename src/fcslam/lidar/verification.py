@@ -25,7 +25,8 @@ ALIGNMENT_SCALE_M = 0.4
 """A guess between submaps is worse than one between scans: the loss starts wider."""
 INFORMATIVE = 30.0
 """Least eigenvalue of the normal tensor of an informative closure; a corridor has less."""
-CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD = 0.03, 0.006
+CLOSURE_SIGMA_M = 0.03
+CLOSURE_SIGMA_RAD = 0.2 * CLOSURE_SIGMA_M
 """Least standard deviations of a closure, however many points it has."""
 SYMMETRY_M, SYMMETRY_RAD = 5.0 * CLOSURE_SIGMA_M, 5.0 * CLOSURE_SIGMA_RAD
 """Largest motion between the alignments of both directions."""

@@ -48,11 +48,11 @@ def beams_on_teammates(
         since_s: time since then.
         joint, radius_m: the joint map, and the radius of a robot.
     """
-    rays = rays_of(scan.laser, scan.sweep)
+    origins, directions = rays_of(scan.laser, scan.sweep)
     found: NDArray[np.bool_] | None = _on_discs(
         scan.ranges_m,
-        rays.origins,
-        rays.directions,
+        origins,
+        directions,
         scan.laser.max_range_m,
         T_map_before,
         T_odom_before,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fcslam.errors import InputError
-from fcslam.lidar.facing import Contradiction, FacingWatch
+from fcslam.lidar.facing import Contradiction, watch_facing
 from fcslam.lidar.leaning import wrong_laser
 from fcslam.live.inputs import Lasers, checked_lasers, checked_robot, checked_scan, checked_stamp
 from fcslam.live.records import EventKind, RobotEvent, RobotPose
@@ -63,7 +63,7 @@ class LiveTracker(ABC):
         self._determined_s = -math.inf
         """Stamp of the newest scan that fixed the position; infinity after the event that none does."""
         self._is_finished = False
-        self._facing: defaultdict[tuple[float, float, float], FacingWatch] = defaultdict(FacingWatch)
+        self._facing: defaultdict[tuple[float, float, float], list[LaserScan]] = defaultdict(list)
         """By the mounting of a laser."""
         self._examined: deque[Future[FloorLine | Contradiction | None]] = deque()
         """What the worker finds wrong with each laser: it takes as long as hundreds of scans."""
@@ -179,7 +179,7 @@ class LiveTracker(ABC):
             self._tell_undetermined(pose)
         if (fault := self._frontend.odometry.check.fault) is not None:
             self._tell_failure(f"the odometry {fault}; scan matching alone gives the motion")
-        if watched := self._facing[scan.laser.T_base_laser].add(scan):
+        if watched := watch_facing(self._facing[scan.laser.T_base_laser], scan):
             with suppress(RuntimeError):  # a worker that has ended is told by what needs it
                 self._examined.append(self._executor.submit(wrong_laser, watched))
         self._tell_examined()

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from fcslam.geometry.beams import beam_step
-from fcslam.lidar.lasers import Lasers
+from fcslam.lidar.frontend import laser_index
 from fcslam.lidar.own_body import Polygon, Sectors, is_in_polygon, is_in_sectors
 from fcslam.lidar.scan import rays_of
 from fcslam.records import Beams, LaserModel, LaserScan, Sweep, frozen
@@ -25,7 +25,7 @@ class MappedScans:
     def __init__(self, ignore: Sectors = (), footprint: Polygon = ()) -> None:
         """Beams in the sectors ``ignore`` and returns within ``footprint`` are left out."""
         self._ignore, self._footprint = ignore, footprint
-        self._lasers = Lasers()
+        self._lasers: list[LaserModel] = []
 
     def of(self, scan: LaserScan) -> LaserScan:
         """The scan as it is mapped.
@@ -34,15 +34,15 @@ class MappedScans:
         No return is inf; an invalid range, or one at the maximum, is 0. All are 0 in a scan without any return, as of
         a covered laser: it does not show that the floor is free.
         """
-        index = self._lasers.index(scan.laser)
-        step = beam_step(self._lasers.known[index].beams)
+        first = self._lasers[laser_index(self._lasers, scan.laser)]
+        step = beam_step(first.beams)
         laser = _mapped_laser(scan.laser, step)
         ranges_m = scan.ranges_m[::step]
         if self._ignore:
             ranges_m = np.where(is_in_sectors(laser, self._ignore), np.float32(0.0), ranges_m)
         if self._footprint:
-            rays = rays_of(laser)  # the body moves with the laser
-            points = rays.origins + np.minimum(ranges_m, laser.max_range_m)[:, None] * rays.directions
+            origins, directions = rays_of(laser)  # the body moves with the laser
+            points = origins + np.minimum(ranges_m, laser.max_range_m)[:, None] * directions
             ranges_m = np.where(is_in_polygon(points, self._footprint), np.float32(0.0), ranges_m)
         sweep = _mapped_sweep(scan.sweep, scan.laser.beam_count, step)
         ranges_m = rounded(ranges_m, laser.max_range_m)
