@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from worlds.changing import ChangingBuilding, close_doors, doors_after, doors_of, with_closed_doors
+from worlds.changing import ChangingBuilding, close_doors, doors_after, doors_of
 
-from fcslam.lab.simulation.floorplan import PieceKind, draw_floor_plan
+from fcslam.lab.simulation.floorplan import draw_floor_plan
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.options import Building
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
@@ -56,11 +56,3 @@ def test_doors_that_a_robot_drives_through_are_open_and_far_ones_stay_as_they_we
     assert through == everything - {0}
     assert doors_after(plan, everything, 0.0, centres[:1], np.random.default_rng(0)) == far
     assert doors_after(plan, frozenset(), 1.0, centres[:1], np.random.default_rng(0)) == everything - far - {0}
-
-
-def test_a_closed_door_is_a_wall():
-    plan = draw_floor_plan(np.random.default_rng(4))
-    closed = with_closed_doors(plan, frozenset({2}))
-    assert len(closed.segments) == len(plan.segments) + 4
-    assert closed.pieces[-1].kind is PieceKind.WALL
-    np.testing.assert_array_equal(closed.pieces[-1].outline, doors_of(plan)[2].outline)

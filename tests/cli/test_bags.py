@@ -18,17 +18,6 @@ def run(*arguments):
     return main([*map(str, arguments)])
 
 
-def refused(capsys, *arguments):
-    """The one line of a command that is refused."""
-    capsys.readouterr()
-    assert run(*arguments) == 2
-    out, error = capsys.readouterr()
-    assert out == ""
-    assert error.startswith("fcslam: ")
-    assert error.count("\n") == 1
-    return error
-
-
 def robots(folder):
     with (folder / "robots.csv").open(newline="") as file:
         return {row["robot"]: int(row["scans"]) for row in csv.DictReader(file)}
@@ -60,11 +49,11 @@ def test_a_bag_made_of_a_log_gives_the_same_trajectory(logs, from_log, tmp_path,
 
 
 @pytest.mark.parametrize("copy", ["copy.bag", "copy.mcap"])
-def test_a_copy_of_a_recording_under_another_name_is_refused(tmp_path, capsys, copy):
+def test_a_copy_of_a_recording_under_another_name_is_refused(tmp_path, refused, copy):
     bag, copy = save(tmp_path / "run.bag", drive(40)), save(tmp_path / copy, drive(40))
-    assert "copy and run share 40 scans" in refused(capsys, "map", bag, copy, "-o", tmp_path / "out")
+    assert "copy and run share 40 scans" in refused("map", bag, copy, "-o", tmp_path / "out")
     cut = save(tmp_path / "cut.mcap", [mounted(), *drive(40)[30:]])
-    assert "cut and run share " in refused(capsys, "map", bag, cut, "-o", tmp_path / "out")
+    assert "cut and run share " in refused("map", bag, cut, "-o", tmp_path / "out")
     other = save(tmp_path / "other.bag", drive(40, start=150.0))
     assert run("map", bag, other, "-o", tmp_path / "out") == 0
 
@@ -82,10 +71,10 @@ def test_choices_and_faults_are_said(tmp_path, capsys):
 # Names
 
 
-def test_names_tell_equal_files_apart(tmp_path, bag, capsys):
+def test_names_tell_equal_files_apart(tmp_path, bag, refused):
     twin = save(tmp_path / "run1.mcap", drive(15))
-    assert "NAME=LOG" in refused(capsys, "map", bag, twin, "-o", tmp_path / "out")
-    assert "so they are copies" in refused(capsys, "map", bag, f"ben={bag}", "-o", tmp_path / "out")
+    assert "NAME=LOG" in refused("map", bag, twin, "-o", tmp_path / "out")
+    assert "so they are copies" in refused("map", bag, f"ben={bag}", "-o", tmp_path / "out")
     assert run("map", f"anna={bag}", f"ben={twin}", "-o", tmp_path / "out") == 0
     assert robots(tmp_path / "out") == {"anna": 40, "ben": 15}
 
@@ -99,23 +88,23 @@ def test_a_file_with_an_equals_sign_is_a_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["an/na", "x" * 80, "+", " "])
-def test_a_bad_name_is_refused(tmp_path, bag, capsys, name):
-    assert "name" in refused(capsys, "map", f"{name}={bag}", "-o", tmp_path / "out")
+def test_a_bad_name_is_refused(tmp_path, bag, refused, name):
+    assert "name" in refused("map", f"{name}={bag}", "-o", tmp_path / "out")
 
 
-def test_a_name_without_a_file(tmp_path, capsys):
-    assert "none.bag: no such file" in refused(capsys, "map", f"anna={tmp_path}/none.bag", "-o", tmp_path / "out")
-    assert "no such file" in refused(capsys, "map", f"={tmp_path}/none.bag", "-o", tmp_path / "out")
+def test_a_name_without_a_file(tmp_path, refused):
+    assert "none.bag: no such file" in refused("map", f"anna={tmp_path}/none.bag", "-o", tmp_path / "out")
+    assert "no such file" in refused("map", f"={tmp_path}/none.bag", "-o", tmp_path / "out")
 
 
 # Refusals
 
 
 @pytest.mark.parametrize("given", ["scan-topic=/scan", "odom-topic=/odom", "laser-pose=0,0,0"])
-def test_options_of_bags_go_with_bags_only(tmp_path, bag, capsys, given):
+def test_options_of_bags_go_with_bags_only(tmp_path, bag, refused, given):
     log = carmen_text.save(tmp_path / "a.log", carmen_text.drive(40))
-    assert "a.log: a CARMEN log" in refused(capsys, "map", bag, log, "--sensors", given, "-o", tmp_path / "out")
-    assert "a.log: a CARMEN log" in refused(capsys, "record", log, "-o", tmp_path / "a.bag", "--sensors", given)
+    assert "a.log: a CARMEN log" in refused("map", bag, log, "--sensors", given, "-o", tmp_path / "out")
+    assert "a.log: a CARMEN log" in refused("record", log, "-o", tmp_path / "a.bag", "--sensors", given)
 
 
 @pytest.mark.parametrize(
@@ -130,12 +119,12 @@ def test_options_of_bags_go_with_bags_only(tmp_path, bag, capsys, given):
         (["cloud-band=0.1,0.6,-1"], "is not a band of heights"),
     ],
 )
-def test_a_key_of_the_sensors_that_is_none(tmp_path, bag, capsys, given, reason):
+def test_a_key_of_the_sensors_that_is_none(tmp_path, bag, refused, given, reason):
     options = [word for value in given for word in ("--sensors", value)]
-    assert reason in refused(capsys, "map", bag, *options, "-o", tmp_path / "out")
+    assert reason in refused("map", bag, *options, "-o", tmp_path / "out")
 
 
-def test_bad_bags_leave_nothing(tmp_path, capsys):
+def test_bad_bags_leave_nothing(tmp_path, refused):
     (tmp_path / "empty.bag").write_bytes(b"#ROSBAG V2.0\n")
     bad = {
         save(tmp_path / "nothing.bag", [text(1.0)]): "no laser scans",
@@ -143,8 +132,8 @@ def test_bad_bags_leave_nothing(tmp_path, capsys):
         tmp_path / "empty.bag": "there are no topics",
     }
     for path, reason in bad.items():
-        assert reason in refused(capsys, "map", path, "-o", tmp_path / "out")
-        assert reason in refused(capsys, "record", path, "-o", tmp_path / "out.mcap")
+        assert reason in refused("map", path, "-o", tmp_path / "out")
+        assert reason in refused("record", path, "-o", tmp_path / "out.mcap")
     assert {path.name for path in tmp_path.iterdir()} == {path.name for path in bad}
 
 
@@ -161,10 +150,10 @@ def test_every_format_can_be_written_and_read(tmp_path, bag, name, capsys):
 
 
 @pytest.mark.parametrize("name", ["a.bag", "folder"])
-def test_only_force_replaces(tmp_path, bag, capsys, name):
+def test_only_force_replaces(tmp_path, bag, refused, name):
     output = tmp_path / name
     assert run("record", bag, "-o", output) == 0
-    assert "--force" in refused(capsys, "record", bag, "-o", output)
+    assert "--force" in refused("record", bag, "-o", output)
     shorter = save(tmp_path / "short.mcap", drive(12))
     assert run("record", shorter, "-o", output, "--force") == 0
     assert open_source(output).survey().scan_count == 12
@@ -172,14 +161,14 @@ def test_only_force_replaces(tmp_path, bag, capsys, name):
     assert open_source(output).survey().scan_count == 12
 
 
-def test_what_convert_refuses(tmp_path, bag, capsys):
+def test_what_convert_refuses(tmp_path, bag, refused):
     for name in ("a.zip", "a.clf"):
-        assert f"{name}: not a kind of bag" in refused(capsys, "record", bag, "-o", tmp_path / name)
+        assert f"{name}: not a kind of bag" in refused("record", bag, "-o", tmp_path / name)
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "main.tex").touch()
-    assert "not a recording" in refused(capsys, "record", bag, "-o", tmp_path / "thesis", "--force")
+    assert "not a recording" in refused("record", bag, "-o", tmp_path / "thesis", "--force")
     assert (tmp_path / "thesis" / "main.tex").exists()
     (tmp_path / "dir.bag").mkdir()
-    assert "is a folder" in refused(capsys, "record", bag, "-o", tmp_path / "dir.bag", "--force")
-    assert "cannot be written" in refused(capsys, "record", bag, "-o", bag / "a.mcap")
-    assert "no such file" in refused(capsys, "record", tmp_path / "none.bag", "-o", tmp_path / "a.mcap")
+    assert "is a folder" in refused("record", bag, "-o", tmp_path / "dir.bag", "--force")
+    assert "cannot be written" in refused("record", bag, "-o", bag / "a.mcap")
+    assert "no such file" in refused("record", tmp_path / "none.bag", "-o", tmp_path / "a.mcap")

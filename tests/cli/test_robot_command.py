@@ -89,18 +89,14 @@ def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
         (["--credentials", "{ca.pem: x}"], "cannot read a certificate authority"),
     ],
 )
-def test_what_is_wrong_is_one_line(log, cloud, tmp_path, capsys, arguments, reason):
+def test_what_is_wrong_is_one_line(log, cloud, tmp_path, refused, arguments, reason):
     if arguments[-1].startswith("{"):  # a folder with these files
         folder = tmp_path / "credentials"
         folder.mkdir()
         for name, content in yaml.safe_load(arguments[-1]).items():
             (folder / name).write_text(content)
         arguments = [*arguments[:-1], str(folder)]
-    given = ["--server", cloud.url, "--state", str(tmp_path / "state")]
-    assert main(["play", str(log), *given, *arguments]) == 2
-    err = capsys.readouterr().err
-    assert reason in err
-    assert err.count("\n") == 1
+    assert reason in refused("play", log, "--server", cloud.url, "--state", tmp_path / "state", *arguments)
     assert cloud.cloud.stored == {}
 
 
@@ -115,17 +111,13 @@ def test_what_is_wrong_is_one_line(log, cloud, tmp_path, capsys, arguments, reas
         (["localize", "ros2:/robot1", "--map", "no", "--update"], "record the drive, and localize the recording"),
     ],
 )
-def test_what_a_robot_cannot_use_is_one_line(capsys, arguments, reason):
-    assert main(arguments) == 2
-    err = capsys.readouterr().err
-    assert reason in err
-    assert err.count("\n") == 1
+def test_what_a_robot_cannot_use_is_one_line(refused, arguments, reason):
+    assert reason in refused(*arguments)
 
 
-def test_a_cloud_that_turns_the_robot_away_is_one_line(log, cloud, tmp_path, capsys):
+def test_a_cloud_that_turns_the_robot_away_is_one_line(log, cloud, tmp_path, refused):
     cloud.canned.append((401, {}, b'{"error": "no token"}'))
-    assert main(["play", str(log), "--server", cloud.url, "--state", str(tmp_path)]) == 2
-    assert f"fcslam: {cloud.url}: no token (401)" in capsys.readouterr().err
+    assert f"fcslam: {cloud.url}: no token (401)" in refused("play", log, "--server", cloud.url, "--state", tmp_path)
 
 
 @pytest.fixture

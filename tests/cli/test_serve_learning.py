@@ -4,7 +4,6 @@ import pytest
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
-from fcslam.cli import main
 from fcslam.cli.training_options import learning_plan
 from fcslam.errors import InputError
 from fcslam.records import Channel
@@ -19,13 +18,11 @@ from fcslam.wire.http_transport import Server
         (["--learn", "--store", "postgresql://u@h/d"], "leave out --store"),
     ],
 )
-def test_a_service_that_cannot_learn_says_why(options, reason, tmp_path, monkeypatch, capsys):
+def test_a_service_that_cannot_learn_says_why(options, reason, tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "few").mkdir()
     (tmp_path / "few" / "learning.yaml").write_text("fewest_pairs: 0")
-    assert main(["serve", "--data", str(tmp_path / "data"), "--port", "0", *options]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert reason in line
+    assert reason in refused("serve", "--data", tmp_path / "data", "--port", 0, *options)
     assert not (tmp_path / "data").exists()
 
 

@@ -29,56 +29,44 @@ def run(tmp_path):
     return tmp_path / "run"
 
 
-def refused(capsys, *words):
-    """The one line that the command says."""
-    assert main(["show", *map(str, words)]) == 2
-    line = capsys.readouterr().err
-    assert line.count("\n") == 1
-    return line
-
-
-def test_what_is_no_run_is_told_in_one_line(run, tmp_path, capsys):
+def test_what_is_no_run_is_told_in_one_line(run, tmp_path, refused):
     (tmp_path / "text").write_text("no mission")
-    assert "not a run folder" in refused(capsys, tmp_path)
-    assert "not a run folder" in refused(capsys, tmp_path / "nothing")
-    assert "text" in refused(capsys, tmp_path / "text")
+    assert "not a run folder" in refused("show", tmp_path)
+    assert "not a run folder" in refused("show", tmp_path / "nothing")
+    assert "text" in refused("show", tmp_path / "text")
     (run / "closures.csv").write_text("damaged")
-    assert "damaged run folder" in refused(capsys, run)
+    assert "damaged run folder" in refused("show", run)
 
 
-def test_a_damaged_map_is_told_in_one_line(run, capsys):
-    (run / "map.pgm").write_bytes(b"P5 60 40 255 ")
-    assert "map.pgm" in refused(capsys, run)
+@pytest.mark.parametrize("name", ["map.pgm", "mission.fcslam"])
+def test_a_damaged_file_is_told_in_one_line(run, name, refused):
+    (run / name).write_text("P5 60 40 255 ")
+    assert name in refused("show", run)
 
 
-def test_a_damaged_mission_file_is_told_in_one_line(run, capsys):
-    (run / "mission.fcslam").write_text("no mission")
-    assert "mission.fcslam" in refused(capsys, run)
-
-
-def test_a_huge_run_is_refused_before_it_is_read(run, capsys):
+def test_a_huge_run_is_refused_before_it_is_read(run, refused):
     with (run / "map.pgm").open("ab") as file:
         file.truncate(LARGEST_BYTES + 1)  # without a block on the disk
-    assert "GiB" in refused(capsys, run)
+    assert "GiB" in refused("show", run)
 
 
-def test_a_port_in_use_is_told_in_one_line(run, capsys):
+def test_a_port_in_use_is_told_in_one_line(run, refused):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        assert f":{port}" in refused(capsys, run, "--port", port)
+        assert f":{port}" in refused("show", run, "--port", port)
 
 
-def test_a_report_is_one_file_and_replaces_another_only_if_told(run, tmp_path, capsys):
+def test_a_report_is_one_file_and_replaces_another_only_if_told(run, tmp_path, capsys, refused):
     report = tmp_path / "report.html"
     assert main(["show", str(run), "--html", str(report)]) == 0
     assert "report.html" in capsys.readouterr().out
     before = report.read_bytes()
     assert b"maps/0/tiles/5/0/0.png" in before
-    assert "--force" in refused(capsys, run, "--html", report)
+    assert "--force" in refused("show", run, "--html", report)
     assert main(["show", str(run), "--html", str(report), "--force"]) == 0
     assert report.read_bytes() == before
-    assert "cannot be written" in refused(capsys, run, "--html", tmp_path / "no" / "report.html")
-    assert "exists" in refused(capsys, run, "--html", tmp_path, "--force")
+    assert "cannot be written" in refused("show", run, "--html", tmp_path / "no" / "report.html")
+    assert "exists" in refused("show", run, "--html", tmp_path, "--force")
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ from fcslam.wire.limits import KEYPOINT_AXES, MAXIMUM_BEAMS, MAXIMUM_KEYPOINTS
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import encode
 from fcslam.wire.quantisation import dequantise
+from tests.fuzz.mutations import mutate
 
 GOLDEN = Path(__file__).parents[1] / "wire" / "golden"
 SIZES = {1: 100, 3: 100, 10: 50, 30: 20, 100: 5, 300: 1, MAXIMUM_KEYPOINTS: 1}
@@ -74,30 +75,8 @@ def bodies(rng: np.random.Generator, size: int) -> Iterator[Any]:
     yield DetectorUpdate("alice", DetectorFile(Channel.CAMERA, "light-2", 1, size, rng.bytes(32)))
 
 
-def flip(rng: random.Random, corpus: list[bytes]) -> bytes:
-    data = bytearray(rng.choice(corpus))
-    for _ in range(rng.choice((1, 1, 1, 2, 4, 16))):
-        bit = rng.randrange(8 * len(data))
-        data[bit // 8] ^= 1 << bit % 8
-    return bytes(data)
-
-
-def edit(rng: random.Random, corpus: list[bytes]) -> bytes:
-    data = rng.choice(corpus)
-    for _ in range(rng.choice((1, 1, 2, 4))):
-        at = rng.randrange(min(len(data), 200) + 1) if rng.random() < 0.7 else rng.randrange(len(data) + 1)
-        data = data[:at] + rng.randbytes(rng.randrange(4)) + data[at + rng.randrange(4) :]
-    return data
-
-
-def cut(rng: random.Random, corpus: list[bytes]) -> bytes:
-    data = rng.choice(corpus)
-    return data[: rng.randrange(len(data))]
-
-
-def splice(rng: random.Random, corpus: list[bytes]) -> bytes:
-    data, other = rng.choice(corpus), rng.choice(corpus)
-    return data[: rng.randrange(len(data) + 1)] + other[rng.randrange(len(other) + 1) :]
+def broken(rng: random.Random, corpus: list[bytes]) -> bytes:
+    return mutate(rng, rng.choice(corpus), corpus)
 
 
 def swap_fields(rng: random.Random, corpus: list[bytes]) -> bytes:
@@ -208,10 +187,7 @@ def noise(rng: random.Random, corpus: list[bytes]) -> bytes:
 
 Breaker = Callable[[random.Random, list[bytes]], bytes]
 BREAKERS: dict[str, Breaker] = {
-    "bits flipped": flip,
-    "bytes edited": edit,
-    "cut off": cut,
-    "spliced": splice,
+    "bytes broken": broken,
     "fields swapped": swap_fields,
     "foreign fields": foreign_fields,
     "bombs": bomb,

@@ -2,7 +2,7 @@
 
 import os
 import signal
-from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import BrokenExecutor, Future
 
 import pytest
 
@@ -11,6 +11,7 @@ from fcslam.robot.backend_runner import copied_worker, in_worker
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.packets import encode
 from tests import small_fleet
+from tests.live.same_thread import SameThread
 from tests.robot.kidnapping import kidnapping
 
 pytestmark = pytest.mark.slow
@@ -23,29 +24,21 @@ def scans():
     return list(small_fleet.draw(1, path_length_m=12.0).robots[0].scans())
 
 
-class Held(Executor):
+class Held(SameThread):
     """Works on request, and breaks after so many tasks."""
 
     def __init__(self, breaks_after=10**9):
+        super().__init__()
         self._left = breaks_after
-        self._tasks = []
-        self.holds = False
 
     def submit(self, function, /, *arguments):
-        future = Future()
-        self._tasks.append((future, function, arguments))
-        if not self.holds:
-            self.work()
-        return future
+        return super().submit(self._done, function, *arguments)
 
-    def work(self):
-        for future, function, arguments in self._tasks:
-            self._left -= 1
-            if self._left < 0:
-                future.set_exception(BrokenExecutor("it was killed"))
-            else:
-                future.set_result(function(*arguments))
-        self._tasks.clear()
+    def _done(self, function, *arguments):
+        self._left -= 1
+        if self._left < 0:
+            raise BrokenExecutor("it was killed")
+        return function(*arguments)
 
 
 def driven(scans, backend=None):

@@ -66,26 +66,17 @@ def test_what_was_fetched_is_taken_before_the_next_record(start):
     assert updates.notice == "detector second from now on"
 
 
-def test_a_resumed_recording_takes_the_same_at_the_same_place(start):
+@pytest.mark.parametrize(("catching_up", "second"), [(9, 10), (0, 7)])
+def test_a_resumed_recording_takes_the_same_at_the_same_place_and_news_after_it(start, catching_up, second):
     updates, frontend = start()
     updates.store(FIRST, b"network")
     drive(updates, frontend, range(5, 9))
     again, frontend = start(resume=True)
     again.store(FIRST, b"network")  # it is announced again
     again.store(SECOND, b"network")
-    assert drive(again, frontend, range(20), catching_up=9) == {5: FIRST.version, 10: "second"}
+    assert drive(again, frontend, range(20), catching_up) == {5: FIRST.version, second: "second"}
     anew, frontend = start()
     assert drive(anew, frontend, range(20)) == {}, "another session"
-
-
-def test_news_wait_for_what_was_taken_before(start):
-    """Even if nothing was said since then."""
-    updates, frontend = start()
-    updates.store(FIRST, b"network")
-    drive(updates, frontend, range(5, 9))
-    again, frontend = start(resume=True)
-    again.store(SECOND, b"network")
-    assert drive(again, frontend, range(20)) == {5: FIRST.version, 6: "second"}
 
 
 def test_one_that_cannot_be_used_is_said_and_nothing_stops(start):

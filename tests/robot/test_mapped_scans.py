@@ -51,16 +51,19 @@ def test_of_beams_closer_than_a_quarter_degree_every_kth_is_mapped_at_most_half_
     np.testing.assert_allclose(keyscan.ranges_m, scan.ranges_m[::step], atol=0.0011)
 
 
-def test_the_last_beams_of_a_dense_scan_need_not_fill_a_step():
-    scan = scan_of(laser(3199, turns=0.75))
+@pytest.mark.parametrize(
+    ("model", "step"),
+    [
+        (laser(3199, turns=0.75), 5),
+        (replace(laser(1440), angle_increment_rad=0.00436), 1),
+        (LaserModel(5, 0.0, 1e-6, 20.0), 4),
+    ],
+    ids=["the last beams fill no step", "a header that rounds a quarter degree", "two beams of a narrow view"],
+)
+def test_every_kth_beam_is_kept(model, step):
+    scan = scan_of(model)
     (announced,), keyscan = mapped(scan)
-    assert announced.beam_count == len(keyscan.ranges_m) == len(scan.ranges_m[::5])
-
-
-def test_a_header_that_rounds_a_quarter_degree_changes_nothing():
-    model = replace(laser(1440), angle_increment_rad=0.00436)
-    (announced,), _ = mapped(scan_of(model))
-    assert announced == model
+    assert announced.beam_count == len(keyscan.ranges_m) == len(scan.ranges_m[::step])
 
 
 def test_a_dense_scanner_whose_beams_vary_remains_one_laser():
@@ -70,12 +73,6 @@ def test_a_dense_scanner_whose_beams_vary_remains_one_laser():
     assert announced.beam_count == 1442
     (announced,), _ = mapped(*(replace(scan_of(laser(n)), stamp=0.1 * k) for k, n in enumerate(counts[::-1])))
     assert announced.beam_count == 1490 // 2
-
-
-def test_two_beams_remain_of_a_narrow_view():
-    model = LaserModel(5, 0.0, 1e-6, 20.0)
-    (announced,), _ = mapped(scan_of(model))
-    assert announced.beam_count == 2
 
 
 def test_a_maximum_range_beyond_that_of_packets_is_announced_as_theirs():

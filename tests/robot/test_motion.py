@@ -151,14 +151,22 @@ def cut(scans, begin_s, end_s):
     return [scan for scan in scans if not begin_s <= scan.stamp < end_s]
 
 
-@pytest.mark.parametrize(("begin_s", "end_s"), [(5.0, 7.5), (9.0, 12.0), (11.0, 13.0), (7.0, 10.5)])
-def test_without_odometry_a_robot_that_drives_on_in_a_gap_of_its_scans_is_found_again(begin_s, end_s):
-    """It moves by up to 1.0 m and 2.1 rad in these gaps."""
-    scans = cut(spinning.drive(25.0), begin_s, end_s)
+@pytest.mark.parametrize(
+    "gaps",
+    [
+        [(5.0, 7.5)], [(9.0, 12.0)], [(11.0, 13.0)], [(7.0, 10.5)],
+        [(8.0, 10.5), (11.0, 13.5)], [(5.0, 7.5), (9.0, 10.2)], [(7.0, 10.5), (12.0, 13.2)],
+    ],
+)  # fmt: skip
+def test_without_odometry_a_robot_that_drives_on_in_gaps_of_its_scans_is_found_again(gaps):
+    """It moves by up to 1.0 m and 2.1 rad in a gap. A few scans between two gaps enter no map at a wrong place."""
+    scans = list(spinning.drive(25.0))
+    for gap in gaps:
+        scans = cut(scans, *gap)
     frontend, _ = mapped(scans)
-    assert len(frontend.tracks) == 1
-    assert len(frontend.tracks[0]) == len(scans)
-    assert spinning.error_m(frontend.tracks[0]) < 0.01
+    assert sum(len(track) for track in frontend.tracks) == len(scans)
+    assert len(frontend.tracks) == 1 or len(gaps) == 2
+    assert all(spinning.error_m(track) < 0.01 * len(gaps) for track in frontend.tracks)
 
 
 @pytest.mark.parametrize(("moved_s", "sessions"), [(0.0, 1), (12.0, 2)])
@@ -167,16 +175,6 @@ def test_after_a_long_gap_without_odometry_a_robot_must_be_where_it_was(moved_s,
     later = (replace(scan, stamp=scan.stamp + 60.0 - moved_s) for scan in spinning.drive(8.0, begin_s=9.0 + moved_s))
     frontend, _ = mapped([*spinning.drive(9.0), *later])
     assert len(frontend.tracks) == sessions
-
-
-@pytest.mark.parametrize("gaps", [[(8.0, 10.5), (11.0, 13.5)], [(5.0, 7.5), (9.0, 10.2)], [(7.0, 10.5), (12.0, 13.2)]])
-def test_a_few_scans_between_two_gaps_do_not_enter_a_map_at_a_wrong_place(gaps):
-    scans = list(spinning.drive(25.0))
-    for gap in gaps:
-        scans = cut(scans, *gap)
-    frontend, _ = mapped(scans)
-    assert sum(len(track) for track in frontend.tracks) == len(scans)
-    assert all(spinning.error_m(track) < 0.02 for track in frontend.tracks)
 
 
 def test_the_first_scan_without_odometry_has_a_pose_before_the_second_comes():

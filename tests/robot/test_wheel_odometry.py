@@ -28,6 +28,12 @@ def wandering(count, seed):
     return np.array(poses)
 
 
+def bridged(poses):
+    """The poses after the bridges, and the number of jumps."""
+    odometry = WheelOdometry()
+    return np.array([odometry.place(scan).T_odom_base for scan in scans_of(poses)]), odometry.jumps
+
+
 def test_odometry_without_a_jump_is_not_touched():
     scans, odometry = scans_of(wandering(100, 0)), WheelOdometry()
     assert all(odometry.place(scan) is scan for scan in scans)
@@ -41,32 +47,29 @@ def test_motions_that_do_not_jump_are_kept_whatever_jumps_lie_between(far, lasti
     poses = wandering(60, 1)
     read = poses.copy()
     read[30 : 30 + lasting] = se2.compose(np.array(far), poses[30 : 30 + lasting])
-    odometry = WheelOdometry()
-    bridged = np.array([odometry.place(scan).T_odom_base for scan in scans_of(read)])
+    found, jumps = bridged(read)
     jumped = {29} | ({29 + lasting} if 30 + lasting < 60 else set())
-    assert odometry.jumps == len(jumped)
+    assert jumps == len(jumped)
     kept = [k for k in range(59) if k not in jumped]
-    np.testing.assert_allclose(se2.relative(bridged)[kept], se2.relative(poses)[kept], atol=1e-6)
-    assert np.hypot(*se2.relative(bridged)[:, :2].T).max() < 0.25
+    np.testing.assert_allclose(se2.relative(found)[kept], se2.relative(poses)[kept], atol=1e-6)
+    assert np.hypot(*se2.relative(found)[:, :2].T).max() < 0.25
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
 def test_a_reading_that_is_no_number_is_bridged(broken):
     poses = wandering(20, 2)
     poses[10] = broken
-    odometry = WheelOdometry()
-    bridged = np.array([odometry.place(scan).T_odom_base for scan in scans_of(poses)])
-    assert np.isfinite(bridged).all()
-    assert odometry.jumps == 1
+    found, jumps = bridged(poses)
+    assert np.isfinite(found).all()
+    assert jumps == 1
 
 
 def test_a_bridge_is_never_taken_for_standing_still():
     """The tracker does not match the scans of a robot that stands."""
     poses = np.zeros((10, 3))
     poses[5:, 0] = 1e3
-    odometry = WheelOdometry()
-    bridged = np.array([odometry.place(scan).T_odom_base for scan in scans_of(poses)])
-    assert np.hypot(*(bridged[5] - bridged[4])[:2]) == pytest.approx(0.02)
+    found, _ = bridged(poses)
+    assert np.hypot(*(found[5] - found[4])[:2]) == pytest.approx(0.02)
 
 
 def test_scans_without_a_clock_may_be_metres_apart():
