@@ -24,7 +24,7 @@ from fcslam.mission.mission import MissionConfig
 from fcslam.runs import RobotTrajectory, Run, open_run
 from fcslam.sources import open_source
 from fcslam.sources.logs.archive import numbered_lines
-from tests.sources.bag_messages import drive, mounted, save
+from tests.sources.bag_messages import END, HEADER, counted, drive, mcap_file, mounted, save
 
 SOURCE = Path(untrusted.__file__).parent
 SECRET = "the content of a private file"
@@ -238,17 +238,6 @@ def test_an_image_that_fills_the_memory_is_not_decoded():
         untrusted.check_image(b"?" * 100)
 
 
-def chunk(content, compression, stated):
-    """An MCAP file with one chunk."""
-    text = compression.encode()
-    body = struct.pack("<QQQI", 0, 1, stated, 0) + struct.pack("<I", len(text)) + text
-    body += struct.pack("<Q", len(content)) + content
-    header = struct.pack("<I", 4) + b"ros2" + struct.pack("<I", 0)
-    records = ((1, header), (6, body), (15, bytes(4)), (2, bytes(20)))
-    magic = b"\x89MCAP0\r\n"
-    return magic + b"".join(bytes([kind]) + struct.pack("<Q", len(data)) + data for kind, data in records) + magic
-
-
 OPEN = r"""
 import re, sys, time
 from pathlib import Path
@@ -266,11 +255,14 @@ print(int(re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[1]
 
 @pytest.mark.parametrize("stated", [100, 1 << 31])
 def test_a_chunk_that_expands_takes_little_memory(tmp_path, stated):
-    path = tmp_path / "bomb.mcap"
-    path.write_bytes(chunk(zstd.compress(bytes(BOMB_BYTES)), "zstd", stated))
+    """It is refused by the size that it states, and unpacked to this size at most."""
+    chunk = struct.pack("<QQQI", 0, 1, stated, 0) + counted("<I", b"zstd")
+    chunk += counted("<Q", zstd.compress(bytes(BOMB_BYTES)))
+    path = mcap_file(tmp_path / "bomb.mcap", [HEADER, (0x06, chunk), *END])
     ended = subprocess.run([sys.executable, "-c", OPEN, path], capture_output=True, text=True, check=True, timeout=60)
     *reason, peak_mb = ended.stdout.splitlines()
     assert len(reason) == 1
+    assert stated < 1000 or "a chunk of 2147 MB would fill the memory" in reason[0]
     assert int(peak_mb) < 500
 
 

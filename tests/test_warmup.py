@@ -9,22 +9,26 @@ import pytest
 
 from fcslam.wire.packets import encode
 
-SCRIPT = """
-import json, sys
+COMPILED = """
+import gc, json, sys
 from pathlib import Path
 from numba.core.dispatcher import Dispatcher
+
+def compiled():
+    return {
+        f"{value.py_func.__module__}.{value.py_func.__name__}": set(map(str, value.signatures))
+        for name, module in list(sys.modules.items()) if name.startswith("fcslam.")
+        for value in vars(module).values() if isinstance(value, Dispatcher)
+    }
+
+"""
+"""The signatures of every function that is compiled, by its name."""
+
+SCRIPT = """
 from fcslam.mission.driving import one_by_one
 from fcslam.robot.frontend import RobotConfig
 from fcslam.warmup import WARM_UPS, is_cold, warm_up_decoding, warm_up_fleet
 from fcslam.sources import open_source
-
-def compiled():
-    found = {}
-    for module in [module for name, module in sys.modules.items() if name.startswith("fcslam.")]:
-        for value in vars(module).values():
-            if isinstance(value, Dispatcher):
-                found[f"{value.py_func.__module__}.{value.py_func.__name__}"] = set(map(str, value.signatures))
-    return found
 
 def news(before):
     return {name: sorted(kinds - before.get(name, set())) for name, kinds in compiled().items()
@@ -68,7 +72,9 @@ print(json.dumps([sum(map(len, cold.values())), sum(map(len, warm.values())), su
 def test_after_the_warm_ups_fleet_and_robots_find_all_their_code_compiled(tmp_path, packets, logs):
     stream = tmp_path / "stream.json"
     stream.write_text(json.dumps([encode(packet).hex() for packet in packets]))
-    done = subprocess.run([sys.executable, "-c", SCRIPT, stream, *logs], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", COMPILED + SCRIPT, stream, *logs], capture_output=True, text=True, check=True
+    )
     cold, warm, hot, is_cold, of_decoding, of_fleet, of_robots, between, legs = json.loads(done.stdout)
     assert cold < warm < hot, "the warm-ups compile something"
     assert not is_cold
@@ -78,21 +84,12 @@ def test_after_the_warm_ups_fleet_and_robots_find_all_their_code_compiled(tmp_pa
 
 
 TRACKING = """
-import gc, json, sys
-from numba.core.dispatcher import Dispatcher
 from fcslam.records import Channel
 from fcslam.robot.backend_runner import in_worker
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.warmup import warm_up_tracking
 from tests.robot.kidnapping import kidnapping
 from tests.robot.test_backend_runner import Held
-
-def compiled():
-    return {
-        f"{name}.{attribute}": sorted(map(str, value.signatures))
-        for name, module in sys.modules.items() if name.startswith("fcslam.")
-        for attribute, value in vars(module).items() if isinstance(value, Dispatcher)
-    }
 
 config, executor = RobotConfig(channels=(Channel.LIDAR,)), Held()
 robot = RobotFrontend("r", config, in_worker("r", config, executor))
@@ -110,5 +107,7 @@ print(json.dumps([cold != warm, gc.get_freeze_count() > 0, len(robot.tracks), wa
 @pytest.mark.slow
 def test_after_the_warm_up_a_robot_finds_all_its_code_compiled():
     root = Path(__file__).parents[1]
-    done = subprocess.run([sys.executable, "-c", TRACKING], cwd=root, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", COMPILED + TRACKING], cwd=root, capture_output=True, text=True, check=True
+    )
     assert json.loads(done.stdout) == [True, True, 2, True]

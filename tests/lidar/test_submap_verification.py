@@ -12,9 +12,7 @@ from fcslam.lidar.submap import (
     Agreement,
     agreement,
     build_submap,
-    read_submap,
     self_violation,
-    submap_bytes,
 )
 from fcslam.lidar.verification import (
     CLOSURE_SIGMA_M,
@@ -22,12 +20,11 @@ from fcslam.lidar.verification import (
     Aligned,
     VerificationConfig,
     _information_of_inverse,
-    _shortfall,
     judge,
     verify,
 )
-from fcslam.records import Reason, ReasonCode
-from tests.lidar.worlds import bare_scan, box, corridor, other_room, path, ring, room, scan_at
+from fcslam.records import ReasonCode
+from tests.lidar.worlds import bare_scan, box, corridor, other_room, ring, room, scan_at
 
 CONFIG = VerificationConfig()
 
@@ -93,6 +90,16 @@ def test_two_different_rooms_are_not_the_same_place(guess):
     assert found.reason.code is not ReasonCode.VERIFIED
 
 
+def test_what_has_little_or_nothing_in_common_is_not_the_same_place(same_room):
+    empty = build_submap([(bare_scan([]), np.zeros(3))])
+    a, anchor_a = submap_along([(1.5 + 0.2 * k, 1.5, 0.0) for k in range(5)], ring(), 0)
+    b, anchor_b = submap_along([(14.5, 10.5 - 0.2 * k, 3.0) for k in range(5)], ring(), 1)
+    for one, other, guess in ((same_room[0][0], empty, np.zeros(3)), (a, b, se2.between(anchor_a, anchor_b))):
+        found = verify(one, other, guess, CONFIG)
+        assert not found.loose
+        assert np.isfinite(found.information).all()
+
+
 def test_a_room_against_itself_turned_around_is_not_the_same_place(same_room):
     (a, anchor_a), (b, anchor_b) = same_room
     turned = se2.compose(se2.compose(se2.inverse(anchor_a), (0, 0, np.pi)), anchor_b)
@@ -117,19 +124,6 @@ def test_a_bare_corridor_is_not_informative(heading):
     axis = se2.transform((0, 0, heading - anchor_b[2]), np.array([[1.0, 0.0]]))[0]
     assert abs(vectors[:, 0] @ axis) > 0.98
     assert values[0] < 0.5 * values[1]
-
-
-def test_too_little_in_common_is_refused():
-    a, anchor_a = submap_along([(1.5 + 0.2 * k, 1.5, 0.0) for k in range(5)], ring(), 0)
-    b, anchor_b = submap_along([(14.5, 10.5 - 0.2 * k, 3.0) for k in range(5)], ring(), 1)
-    assert not verify(a, b, se2.between(anchor_a, anchor_b), CONFIG).loose
-
-
-def test_nothing_seen_is_no_place(same_room):
-    empty = build_submap([(bare_scan([]), np.zeros(3))])
-    found = verify(same_room[0][0], empty, np.zeros(3), CONFIG)
-    assert not found.loose
-    assert np.isfinite(found.information).all()
 
 
 def test_free_space_is_what_beams_crossed():
@@ -171,16 +165,6 @@ def test_a_submap_of_a_noisy_scanner_contradicts_itself():
     assert self_violation(scans(0.15)[:1]) == 0.0
 
 
-def test_a_noisy_scanner_is_allowed_more_violation_and_no_scanner_much():
-    free = Agreement(0.9, 0.08, 600, 0.9, 100.0 * np.eye(3))
-    limits = {noise: _shortfall(free, CONFIG.strict, lambda noise=noise: noise) for noise in (0.0, 0.07, 0.09, 1.0)}
-    assert limits[0.0] == Reason(ReasonCode.IN_FREE_SPACE, 0.08, 0.05)
-    assert limits[0.07] == Reason(ReasonCode.IN_FREE_SPACE, 0.08, 0.07)
-    assert limits[0.09] is None
-    much = replace(free, violation=0.11)
-    assert _shortfall(much, CONFIG.strict, lambda: 1.0) is not None
-
-
 @pytest.mark.parametrize(("violation", "predicted"), [(0.08, False), (0.15, True)])
 def test_noise_is_measured_for_the_gate_that_decides(violation, predicted):
     """0.08 is too much for the strict gate without noise, 0.15 for the loose one."""
@@ -192,17 +176,8 @@ def test_noise_is_measured_for_the_gate_that_decides(violation, predicted):
     assert len(asked) == 1
     assert (decided.strict, decided.loose) == (not predicted, True)
     assert (other.strict, other.loose) == (False, not predicted)
-
-
-@pytest.mark.parametrize("slope", [0.0, 0.3])
-def test_one_wall_is_fixed_in_one_direction_only(slope):
-    walls = path((-5, 2 - 5 * slope), (5, 2 + 5 * slope))
-    a, _ = submap_along([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0)], walls, 0)
-    found = agreement(a, a, np.zeros(3))
-    assert found.count > 50
-    flat = np.hypot(*a.surface.normals.T) > 0
-    assert np.trace(found.normal_tensor[:2, :2]) == pytest.approx(flat.sum())
-    assert found.weakest < 0.05 * np.trace(found.normal_tensor)
+    much = aligned._replace(worse=replace(free, violation=0.11))
+    assert not judge(much, CONFIG, lambda: 1.0, False).strict, "no scanner is allowed much"
 
 
 def walking_along(waypoints, seed, stride_m=0.35):
@@ -268,24 +243,3 @@ def test_information_of_the_inverse_pose(pose):
     spread = np.cov((se2.inverse(drawn) - se2.inverse(pose)).T)
     expected = np.linalg.inv(_information_of_inverse(information, np.array(pose)))
     assert np.allclose(spread, expected, rtol=0.1, atol=0.05 * np.abs(expected).max())
-
-
-def test_a_packed_submap_is_unpacked_as_it_was(same_room):
-    (submap, _), (other, _) = same_room
-    data = submap_bytes(submap)
-    unpacked = read_submap(data)
-    assert submap_bytes(unpacked) == data
-    pairs = [
-        *zip(submap.field.arrays, unpacked.field.arrays, strict=True),
-        (submap.free.cells, unpacked.free.cells),
-        (submap.surface.points, unpacked.surface.points),
-        (submap.surface.normals, unpacked.surface.normals),
-        (submap.surface.solitary, unpacked.surface.solitary),
-    ]
-    for before, after in pairs:
-        assert after.dtype == before.dtype
-        assert after.flags.writeable  # compiled code would be compiled once more
-        assert np.array_equal(after, before)
-    before, after = (verify(one, other, np.zeros(3), CONFIG) for one in (submap, unpacked))
-    assert np.array_equal(after.T_a_b, before.T_a_b)
-    assert np.array_equal(after.information, before.information)

@@ -1,6 +1,5 @@
 import cv2
 import numpy as np
-import pytest
 
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.changes import compare
@@ -49,18 +48,6 @@ def test_sessions_of_one_period_are_fused_as_one():
     keyscans, poses, lasers = together(first, second)
     renamed = [Keyscan(KeyscanId("a", k), 0.0, keyscan.ranges_m) for k, keyscan in enumerate(keyscans)]
     assert np.array_equal(fuse(keyscans, poses, lasers, CONFIG).cells, fuse(renamed, poses, lasers, CONFIG).cells)
-
-
-def test_a_box_that_moved_disappears_here_and_appears_there():
-    found = changed(session("a", 0.0, [(1.0, 1.0, 0.3)]), session("a+1", 100.0, [(1.0, -1.0, 0.3)], seed=1))
-    assert [region.kind for region in sorted(found.regions, key=lambda region: region.y)] == ["appeared", "disappeared"]
-    below, above = sorted(found.regions, key=lambda region: region.y)
-    for region, y in ((below, -1.0), (above, 1.0)):
-        assert np.hypot(region.x - 1.0, region.y - y) < 0.4
-        assert 0.02 < region.area_m2 < 0.3
-        assert region.sessions == ("a+1",)
-    assert found.appeared.sum() * CONFIG.resolution_m**2 == pytest.approx(below.area_m2)
-    assert not (found.appeared & found.disappeared).any()
 
 
 def test_nothing_changed_where_nothing_changed_or_nobody_looked():

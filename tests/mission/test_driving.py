@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from fcslam.records import Keyscan
 from fcslam.robot.frontend import RobotConfig
 from fcslam.sources import open_source
 from fcslam.sources.faults import Fault, Faults
+from tests.waiting import wait_for
 from tests.wire.examples import same
 
 pytestmark = pytest.mark.slow
@@ -124,18 +124,10 @@ def test_processes_end_with_the_one_that_started_them(tmp_path):
     )
     pids = tmp_path / "pids"
     parent = subprocess.Popen([sys.executable, "-c", script], env={**os.environ, "PIDS": str(pids)})
-    await_true(lambda: pids.exists() and len(pids.read_text().split()) == 2)
+    wait_for(lambda: pids.exists() and len(pids.read_text().split()) == 2)
     parent.kill()
     parent.wait()
-    await_true(lambda: not any(is_running(int(pid)) for pid in pids.read_text().split()))
-
-
-def await_true(condition):
-    for _ in range(600):
-        if condition():
-            return
-        time.sleep(0.05)
-    pytest.fail("it never was")
+    wait_for(lambda: not any(is_running(int(pid)) for pid in pids.read_text().split()))
 
 
 def is_running(pid):

@@ -50,6 +50,11 @@ def missions(tmp_path_factory):
     return folder, expected
 
 
+def closed(missions, folder):
+    """Where a test puts a mission, and the content of one whose service was stopped."""
+    return folder / "mission.sqlite", (missions[0] / "closed" / "mission.sqlite").read_bytes()
+
+
 def reopened(path):
     """The mission's content, or why it is refused."""
     try:
@@ -78,7 +83,7 @@ def test_a_mission_that_is_not_damaged_is_served_as_it_was(missions, tmp_path, k
 
 
 def test_a_packet_with_a_changed_byte_is_refused(missions, tmp_path):
-    path, whole = tmp_path / "mission.sqlite", (missions[0] / "closed" / "mission.sqlite").read_bytes()
+    path, whole = closed(missions, tmp_path)
     rng = np.random.default_rng(2)
     for number in (0, 1, 20, 40, *range(2, 118, 5)):
         data = PACKETS[number].data[6000:6008] or PACKETS[number].data  # a large one is in several pages
@@ -117,13 +122,13 @@ def test_after_any_changed_byte_nothing_wrong_is_served(missions, tmp_path, kind
 
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.99])
 def test_a_cut_mission_is_refused(missions, tmp_path, share):
-    path, whole = tmp_path / "mission.sqlite", (missions[0] / "closed" / "mission.sqlite").read_bytes()
+    path, whole = closed(missions, tmp_path)
     path.write_bytes(whole[: int(share * len(whole))])
     assert_refused(path, "damaged or cut off .*; put its backup in its place")
 
 
 def test_a_mission_that_lost_its_tables_is_not_a_new_one(missions, tmp_path):
-    path, whole = tmp_path / "mission.sqlite", (missions[0] / "closed" / "mission.sqlite").read_bytes()
+    path, whole = closed(missions, tmp_path)
     path.write_bytes(whole[:103] + bytes(2) + whole[105:])  # the number of rows in the schema's page
     damaged = path.read_bytes()
     assert_refused(path, "damaged or cut off .*; put its backup in its place")
@@ -131,7 +136,7 @@ def test_a_mission_that_lost_its_tables_is_not_a_new_one(missions, tmp_path):
 
 
 def test_a_text_that_cannot_be_decoded_is_damage(missions, tmp_path):
-    path, whole = tmp_path / "mission.sqlite", (missions[0] / "closed" / "mission.sqlite").read_bytes()
+    path, whole = closed(missions, tmp_path)
     path.write_bytes(whole.replace(b"boss", b"b\xffss"))
     assert_refused(path, "damaged or cut off .*; put its backup in its place")
 

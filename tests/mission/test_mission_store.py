@@ -165,22 +165,6 @@ def test_what_a_robot_believes_creeps_no_further_away_than_what_is_news(store, a
     assert versions == sorted(versions)
 
 
-def test_half_a_turn_to_the_left_is_half_a_turn_to_the_right(store):
-    store.put([], 0.0)
-    store.progress(1, [correction("a", 0.0, theta=np.pi)])
-    told = store.correction("a", 0).correction.version
-    store.progress(2, [correction("a", 0.0, theta=-np.pi)])
-    assert store.correction("a", 0).correction.version == told
-    store.progress(3, [correction("a", 0.0, theta=-np.pi + 2 * NEWS_RAD)])
-    assert store.correction("a", 0).correction.version > told
-
-
-def test_another_map_is_news_wherever_it_lies(store):
-    for map_index in (0, 1):
-        store.progress(1, [correction("a", 1.0, map_index=map_index)])
-        assert store.correction("a", 0).correction.map_index == map_index
-
-
 def test_edits_and_requests_are_kept_in_their_order(store):
     contents = [Veto("a", "b"), Veto("a", "a", (1.5, 2.5)), Removal("b"), Removal("a", 3), Undo(3)]
     edits = [store.edit(content, "boss", float(k)) for k, content in enumerate(contents)]

@@ -25,6 +25,7 @@ from tests import small_fleet
 from tests.live.same_thread import SameThread
 from tests.ros.memory_network import MemoryNetwork, offered
 from tests.ros.ros_messages import CODEC, odometry, scan, transform
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.slow
 
@@ -148,13 +149,6 @@ def running(node):
         node.stop()
         thread.join(120.0)
         assert not thread.is_alive()
-
-
-def wait_for(condition):
-    end = time.monotonic() + 120.0
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.01)
-    assert condition()
 
 
 def save(network, name):

@@ -106,15 +106,6 @@ def test_a_scan_of_a_spinning_scanner_waits_for_the_odometry_of_its_last_beam(ro
     assert sweep.displacement(0.2) == pytest.approx([0.2, 0.0, 0.0], abs=1e-6)
 
 
-def test_odometry_that_stops_holds_no_spinning_scan_for_longer_than_the_next_one(robot):
-    robot.drives(np.arange(1.0, 7.0))
-    robot.hears("/odom", odometry(7.0, (7.0, 0.0, 0.0)))
-    robot.hears("/scan", scan(6.9, RANGES, beam_s=0.2 / 179))
-    robot.hears("/scan", scan(7.1, RANGES, beam_s=0.2 / 179))
-    assert robot.stamps[-1] == 6.9
-    assert robot.records[-1].sweep.displacement(0.2) == pytest.approx([0.2, 0.0, 0.0], abs=1e-3)
-
-
 def test_a_robot_without_odometry_is_mapped_after_some_seconds():
     robot = Robot(odometry=None).hears("/tf_static", transform(0.0, "base_link", "laser"))
     robot.hears("/scan", scan(1.0, RANGES))
@@ -195,19 +186,6 @@ def test_a_missing_mounting_says_who_could_publish_it_and_the_robot_waits():
     assert robot.said == [line]
 
 
-def test_a_camera_whose_clock_is_ahead_delays_no_scan():
-    kinds = {**KINDS, "/camera/image_raw": IMAGE, "/camera/camera_info": CAMERA_INFO}
-    robot = Robot(kinds=kinds, camera="/camera/image_raw", info="/camera/camera_info")
-    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
-    robot.hears("/tf_static", transform(0.0, "base_link", "camera")).hears("/camera/camera_info", camera_info(0.0))
-    for stamp in np.arange(1.0, 20.0):
-        robot.now_s = stamp
-        robot.drives([stamp])
-        assert robot.records == [] or robot.stamps[-1] == stamp
-        robot.hears("/camera/image_raw", image(stamp + 3.0))
-    assert sum(isinstance(record, CameraImage) for record in robot.records) > 10
-
-
 def test_of_several_echoes_the_first_counts():
     robot = Robot(kinds={**KINDS, "/scan": MULTI_ECHO_SCAN}, laser_poses=((0.1, 0.0, 0.0),))
     for stamp in np.arange(1.0, 9.0):
@@ -245,17 +223,6 @@ def two_lasers(**options):
     robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
     robot.hears("/tf_static", transform(0.0, "base_link", "rear", (-0.3, 0.0, 3.0)))
     return robot
-
-
-def test_the_scans_of_two_lasers_come_in_the_order_of_their_stamps():
-    robot = two_lasers()
-    for stamp in np.arange(1.0, 9.0):
-        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0)))
-        robot.hears("/rear", scan(stamp - 0.25, RANGES, "rear"))
-        robot.hears("/scan", scan(stamp - 0.5, RANGES))
-    assert robot.stamps == sorted(robot.stamps)
-    assert len(robot.records) >= 14
-    assert [record.laser.T_base_laser[0] for record in robot.records[:2]] == pytest.approx([LASER_POSE[0], -0.3])
 
 
 def late_by(robot, laser_stops_s, until_s):

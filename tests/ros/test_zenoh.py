@@ -2,16 +2,16 @@
 
 import socket
 import threading
-import time
 
 import numpy as np
 import pytest
 
 from fcslam.errors import InputError
 from fcslam.ros.network import Endpoint, Quality
-from fcslam.ros.ros2_zenoh import ZenohNetwork, attachment, endpoint_of, quality_text, session_config
+from fcslam.ros.ros2_zenoh import ZenohNetwork, endpoint_of, quality_text, session_config
 from fcslam.sources.bags.codec import SCAN, TRANSFORMS
 from tests.ros.ros_messages import CODEC, encoded, scan, transform
+from tests.waiting import wait_for
 
 pytest.importorskip("zenoh", reason="no eclipse-zenoh: make ros-test")
 
@@ -45,13 +45,6 @@ def peer(port):
     peer = zenoh_peer.ZenohPeer(port, domain=3)
     yield peer
     peer.close()
-
-
-def wait_for(condition):
-    end = time.monotonic() + 120.0
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.01)
-    assert condition()
 
 
 def foreign(network):
@@ -154,7 +147,3 @@ def test_quality_in_tokens():
         token = f"@ros2_lv/0/a/0/1/MS/%/%/x/%go/std_msgs::msg::dds_::String_/RIHS01_0/{quality_text(quality)}"
         found = endpoint_of(token, "a")
         assert found == Endpoint("/go", STRING, False, quality._replace(depth=found.quality.depth), True)
-
-
-def test_an_attachment_has_33_bytes():
-    assert attachment(1, 2, bytes(16)) == b"\x01" + bytes(7) + b"\x02" + bytes(7) + b"\x10" + bytes(16)

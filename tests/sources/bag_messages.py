@@ -134,6 +134,21 @@ def mcap_places(content):
         yield opcode, at + 9, (at := at + 9 + size)
 
 
+def mcap_file(path, records):
+    """A file of these records, opcode and content each."""
+    body = b"".join(struct.pack("<BQ", opcode, len(content)) + content for opcode, content in records)
+    path.write_bytes(b"\x89MCAP0\r\n" + body + b"\x89MCAP0\r\n")
+    return path
+
+
+def counted(size, text):
+    return struct.pack(size, len(text)) + text
+
+
+HEADER = (0x01, counted("<I", b"ros2") + counted("<I", b"test"))
+END = [(0x0F, bytes(4)), (0x02, bytes(20))]
+
+
 def _write(writer, messages, store, chunk_bytes=None):
     connections = {}
     for topic, kind, bag_time, fields in messages:

@@ -5,8 +5,11 @@ import tracemalloc
 from collections.abc import Iterable
 from pathlib import Path
 
+import pytest
+
+from fcslam.errors import SourceError
 from fcslam.records import LaserScan, SensorRecord
-from fcslam.sources import Source
+from fcslam.sources import BagOptions, Source, open_source
 
 BEAMS = 8
 
@@ -54,6 +57,17 @@ def peak_of(source: Source) -> int:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return peak
+
+
+def refusal(path: Path | str, options: BagOptions | None = None) -> str:
+    """The line that refuses a recording before any record is read."""
+    with pytest.raises(SourceError) as caught:
+        open_source(path, options).survey()
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path).partition(",")[0] in message
+    assert ";" in message, "says nothing on what to do"
+    return message
 
 
 def scans_of(source: Source) -> list[LaserScan]:

@@ -143,6 +143,19 @@ def test_clouds_that_another_node_moved_are_refused_with_what_to_record(tmp_path
         open_source(save(tmp_path / "moved.mcap", messages)).survey()
 
 
+@pytest.mark.parametrize("parts", [10, 60])
+def test_clouds_of_a_part_of_a_turn_are_refused(tmp_path, parts):
+    messages = [each for each in drive() if each.topic != "/points"]
+    for t in np.arange(0.1, 2.0, 0.1).round(3).tolist():
+        measured = seen(t)
+        for rows in np.array_split(np.arange(len(measured.points)), parts):
+            first_s = measured.times[rows[0]]
+            part, stamp = Measured(measured.points[rows], measured.times[rows] - first_s), START + t + first_s
+            messages.append(said("/points", stamp, cloud(stamp, part, VELODYNE)))
+    with pytest.raises(SourceError, match="let the driver publish whole turns"):
+        open_source(save(tmp_path / "parts.mcap", messages)).survey()
+
+
 @pytest.mark.parametrize("unit", [1000.0, 100.0, 1.0 / 0.3048])
 def test_a_cloud_in_another_unit_is_refused_with_what_to_check(tmp_path, unit):
     def scaled(name, kind, offset, value):

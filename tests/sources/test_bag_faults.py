@@ -16,9 +16,12 @@ from fcslam.errors import SourceError
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import BagOptions, Fault, FaultCount, open_fleet, open_source
 from tests.sources.bag_messages import (
+    END,
     LASER_POSE,
     Said,
+    counted,
     drive,
+    mcap_file,
     mounted,
     odom,
     payload_of,
@@ -28,23 +31,12 @@ from tests.sources.bag_messages import (
     text,
     tf,
 )
-from tests.sources.carmen_text import scans_of
+from tests.sources.carmen_text import refusal, scans_of
 
 pytestmark = pytest.mark.slow
 
 FILES = ["run.bag", "run.mcap", "run.db3"]
 KINDS = [*FILES, "run"]
-
-
-def refusal(path, options=None):
-    """The line that refuses the bag before any record is read."""
-    with pytest.raises(SourceError) as caught:
-        open_source(path, options).survey()
-    message = str(caught.value)
-    assert "\n" not in message
-    assert str(path) in message
-    assert ";" in message, "says nothing on what to do"
-    return message
 
 
 def without(said, topic):
@@ -382,27 +374,6 @@ def test_a_flipped_bag_never_breaks_the_reader(tmp_path, name, data):
 
 
 # Files of MCAP that other programs write
-
-
-def mcap_file(path, records):
-    """A file of these records, opcode and content each."""
-    body = b"".join(struct.pack("<BQ", opcode, len(content)) + content for opcode, content in records)
-    path.write_bytes(b"\x89MCAP0\r\n" + body + b"\x89MCAP0\r\n")
-    return path
-
-
-def counted(size, text):
-    return struct.pack(size, len(text)) + text
-
-
-HEADER = (0x01, counted("<I", b"ros2") + counted("<I", b"test"))
-END = [(0x0F, bytes(4)), (0x02, bytes(20))]
-
-
-def test_a_chunk_that_would_fill_the_memory_is_refused_before_it_is_read(tmp_path):
-    chunk = struct.pack("<QQQI", 0, 1, 2**31, 0) + counted("<I", b"zstd") + counted("<Q", b"never looked at")
-    path = mcap_file(tmp_path / "run.mcap", [HEADER, (0x06, chunk), *END])
-    assert "a chunk of 2147 MB would fill the memory" in refusal(path)
 
 
 @pytest.mark.parametrize(("profile", "encoding"), [(b"", b"cdr"), (b"ros1", b"ros1"), (b"ros2", b"cdr")])

@@ -12,8 +12,7 @@ from fcslam.sources import BagOptions, check_copies, open_fleet, open_source
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.inspection import inspect
 from tests.sources.bag_messages import BEAMS, drive, odom, pose_at, quaternion, save, scan, tf
-from tests.sources.carmen_text import scans_of
-from tests.sources.test_bag_faults import refusal
+from tests.sources.carmen_text import refusal, scans_of
 
 pytestmark = pytest.mark.slow
 

@@ -15,8 +15,7 @@ from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source
 from tests.robot import spinning
 from tests.sources.bag_messages import ROS2, Said, odom, quaternion, save, scan, tf
-from tests.sources.clouds import Measured, cloud, header, plan_ranges, rotation, said, xyz
-from tests.sources.clouds import spinning as spinning_cloud
+from tests.sources.clouds import header, plan_ranges, said
 
 pytestmark = pytest.mark.slow
 
@@ -184,61 +183,6 @@ def test_a_scanner(tmp_path, its):
     said, error_m = outcome(save(tmp_path / "run.mcap", recording(its)))
     assert its.line in said
     assert its.line in WRONG or error_m < 0.005
-
-
-class Cloud(NamedTuple):
-    """How a 3D LiDAR measures, and what its driver says."""
-
-    layout: tuple
-    first_rad: float = -math.pi
-    clockwise: bool = True
-    parts: int = 1
-    """Messages of a turn."""
-    holes: float = 0.0
-    """Range of a beam without a return."""
-
-
-def clouds_of(its: Cloud):
-    R = rotation(yaw=0.4)
-    yield tf(START, "base_link", "lidar", (0.1, 0.0, 0.4), quaternion(0.4), topic="/tf_static")
-    for number in range(30):
-        begin = 0.1 * number
-        turn = spinning_cloud(
-            lambda times, begin=begin: pose_at(begin + times), (0.1, 0.0, 0.4), R, 4, 360, its.clockwise, its.first_rad
-        )
-        turn.points[::50] = its.holes
-        for rows in np.array_split(np.arange(len(turn.points)), its.parts):
-            first_s = turn.times[rows[0]]
-            part = Measured(turn.points[rows], turn.times[rows] - first_s)
-            yield said(
-                "/points", START + begin + first_s, cloud(START + begin + first_s, part, its.layout(START + begin))
-            )
-
-
-def times(kind, unit=1.0, since=0.0, name="timestamp"):
-    """A layout whose field has the times of the points in ``unit``."""
-    return 24, [*xyz(), (name, kind, 16, lambda measured: np.round((since + measured.times) * unit, 9))]
-
-
-CLOUDS = {
-    "velodyne": Cloud(lambda _: times("f4", name="time")),
-    "ouster, ns and zeros": Cloud(lambda _: times("u4", 1e9, name="t"), first_rad=0.0),
-    "hesai, absolute": Cloud(lambda begin: times("f8", 1.0, begin)),
-    "robosense, NaN": Cloud(lambda begin: times("f8", 1.0, begin), holes=NAN),
-    "livox, absolute ns": Cloud(lambda begin: times("f8", 1e9, begin), clockwise=False),
-    "sick multiScan, sectors": Cloud(lambda _: times("u4", 1e9, name="t"), parts=10),
-    "velodyne, packets": Cloud(lambda _: times("f4", name="time"), parts=60),
-}
-
-
-@pytest.mark.parametrize("name", CLOUDS)
-def test_a_3d_lidar(tmp_path, name):
-    its = CLOUDS[name]
-    messages, error_m = outcome(save(tmp_path / "run.mcap", [*readings(3.0), *clouds_of(its)]))
-    if its.parts > 1:
-        assert "let the driver publish whole turns" in messages
-    else:
-        assert error_m < 0.005
 
 
 LASER = Scanner(turns_s=FAST)

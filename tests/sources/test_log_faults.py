@@ -12,20 +12,9 @@ from hypothesis import strategies as st
 
 from fcslam.errors import SourceError
 from fcslam.sources import Fault, FaultCount, open_source
-from tests.sources.carmen_text import BEAMS, drive, flaser, odom, pose_at, save, scans_of
+from tests.sources.carmen_text import BEAMS, drive, flaser, odom, pose_at, refusal, save, scans_of
 
 LOG = "\n".join(drive(3)) + "\n"
-
-
-def refusal(path):
-    """The message that refuses ``path`` before any record is read."""
-    with pytest.raises(SourceError) as caught:
-        open_source(path).survey()
-    message = str(caught.value)
-    assert "\n" not in message
-    assert str(path) in message
-    assert ";" in message, "says nothing on what to do"
-    return message
 
 
 def written(path: Path, content: bytes) -> Path:
@@ -59,20 +48,14 @@ def test_what_is_no_recording_is_refused(tmp_path, content, reason):
 
 
 def test_what_is_no_file_is_refused(tmp_path):
+    """A pipe can be read only once."""
+    os.mkfifo(tmp_path / "pipe.clf")
+    for pipe in (tmp_path / "pipe.clf", Path(os.devnull)):
+        assert "is a pipe or device" in refusal(pipe)
+    assert "name too long" in refusal(tmp_path / ("a" * 400 + ".clf"))
     assert "no such file" in refusal(tmp_path / "missing.clf")
     assert "folder" in refusal(tmp_path)
     assert "cannot be read" in refusal(save(tmp_path / "run.log", drive(2)) / "inside.log")
-
-
-def test_a_pipe_is_refused_because_it_can_be_read_only_once(tmp_path):
-    pipe = tmp_path / "run.clf"
-    os.mkfifo(pipe)
-    assert "is a pipe or device" in refusal(pipe)
-    assert "is a pipe or device" in refusal(Path(os.devnull))
-
-
-def test_a_name_that_is_too_long_is_refused(tmp_path):
-    assert "name too long" in refusal(tmp_path / ("a" * 400 + ".clf"))
 
 
 @pytest.mark.slow

@@ -83,13 +83,6 @@ def test_every_fault_is_counted_in_one_part(tmp_path):
             assert sum(part.faults[kind].count for part in parts) == source.faults[kind].count
 
 
-def test_a_part_can_be_split_again(recording):
-    part = split(recording, 2)[1]
-    again = split(part, 2)
-    assert [robot.name for robot in again] == ["run_2_1", "run_2_2"]
-    assert [scan.stamp for robot in again for scan in scans_of(robot)] == [scan.stamp for scan in scans_of(part)]
-
-
 @pytest.mark.parametrize("parts", [0, -1, 24])
 def test_more_parts_than_scans_are_refused(recording, parts):
     with pytest.raises(SourceError, match="cannot be cut"):

@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from fcslam.errors import SourceError
 from fcslam.sources import open_source
 from tests.sources.bag_messages import mounted, odom, save, scan
-from tests.sources.carmen_text import flaser, scans_of
+from tests.sources.carmen_text import flaser, refusal, scans_of
 from tests.sources.carmen_text import save as save_log
 
 BEAMS = 120
@@ -35,13 +34,6 @@ def bag(path, change=lambda _, values: values, pose=pose, scans=40, **limits):
         fields = {"angle_min": -math.pi / 2, "angle_increment": math.pi / (BEAMS - 1), "range_max": 12.0, **limits}
         said += [odom(100.0 + step, pose(step)), scan(100.0 + step, values, **fields)]
     return save(path, said)
-
-
-def refusal(path):
-    with pytest.raises(SourceError) as caught:
-        open_source(path).survey()
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 @pytest.mark.parametrize(("measuring", "percent"), [(0, "0.0"), (1, "0.8")])

@@ -11,7 +11,6 @@ from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.relations import (
     evaluate_relations,
-    pose_table,
     relation_metrics,
     write_metrics,
 )
@@ -66,27 +65,23 @@ def test_one_robot_is_measured_by_the_same_relations_as_several(folders):
     assert single.translation.maximum < 1e-6
 
 
-def test_one_robot_has_no_relations_across_robots(folders):
-    folder, _ = folders
-    with pytest.raises(InputError, match="no relation between different robots spans more than 20 s"):
-        evaluate_relations(folder / "single", folder / "relations", across_robots=True)
-
-
-def test_a_run_of_no_robot_matches_nothing(folders):
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("single", "no relation between different robots spans more than 20 s"),
+        ("empty", "same recording"),
+        ("apart", r"apart: none of the \d+ relations .* in different maps"),
+    ],
+)
+def test_runs_without_relations_across_robots(folders, name, message):
     folder, _ = folders
     Run({}).save(folder / "empty")
-    assert len(pose_table(Run({})).stamps) == 0
-    with pytest.raises(InputError, match="same recording"):
-        evaluate_relations(folder / "empty", folder / "relations")
-
-
-def test_robots_in_separate_maps_have_no_numbers_across_robots(folders):
-    folder, _ = folders
     run = open_run(folder / "several")
-    apart = {name: replace(each, map_index=k) for k, (name, each) in enumerate(run.trajectories.items())}
-    Run(apart).save(folder / "apart")
-    with pytest.raises(InputError, match=r"apart: none of the \d+ relations .* in different maps"):
-        evaluate_relations(folder / "apart", folder / "relations", across_robots=True)
+    Run({name: replace(each, map_index=k) for k, (name, each) in enumerate(run.trajectories.items())}).save(
+        folder / "apart"
+    )
+    with pytest.raises(InputError, match=message):
+        evaluate_relations(folder / name, folder / "relations", across_robots=True)
 
 
 def test_metrics_are_written_as_csv_and_json(folders):

@@ -1,7 +1,6 @@
 """Pictures with a GL library: they show what stands where it stands, and are worth looking for features in."""
 
 import math
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -116,22 +115,6 @@ def test_an_images_odometry_lies_between_that_of_the_scans_around_it():
         before, next_one = robot.T_odom_base[after - 1 : after + 1]
         low, high = np.minimum(before, next_one)[:2] - 1e-3, np.maximum(before, next_one)[:2] + 1e-3
         assert np.all((image.T_odom_base[:2] >= low) & (image.T_odom_base[:2] <= high))
-
-
-def test_robots_side_by_side_see_what_they_see_alone():
-    def images(robot, into):
-        into.append([item.encoded for item in robot.records() if isinstance(item, CameraImage)])
-
-    alone, together = [], [[], []]
-    robots = simulate_fleet(SMALL, 1).robots
-    for robot in robots:
-        images(robot, alone)
-    threads = [threading.Thread(target=images, args=pair) for pair in zip(robots, together, strict=True)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert [into[0] for into in together] == alone
 
 
 def test_robots_draw_one_after_the_other(monkeypatch):

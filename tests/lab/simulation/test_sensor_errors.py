@@ -72,14 +72,6 @@ def test_biases_grow_with_what_causes_them(bias, turn_share, travel_share):
         np.testing.assert_allclose(wrong[:, 50], wrong[:, 100] / 2.0, atol=1e-9)
 
 
-def test_slips_make_odometry_longer_and_nothing_else():
-    settings = replace(NO_DRIFT, slips_per_m=0.5, slip_m=0.04)
-    rng = np.random.default_rng(0)
-    ends = np.array([simulate_odometry(STRAIGHT, settings, rng)[-1] for _ in range(300)])
-    assert np.mean(ends[:, 0]) == pytest.approx(20.0 + 20.0 * 0.5 * 0.04, abs=0.04)
-    np.testing.assert_allclose(ends[:, 1:], 0.0, atol=1e-12)
-
-
 STAMPS = 100.0 + 0.02 * np.arange(401)
 
 

@@ -1,0 +1,103 @@
+"""Real recordings: the logs that the results are measured on, the published bags, and logs written as bags."""
+
+import gzip
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fcslam.cli import main
+from fcslam.sources import Fault, open_source, split, write_bag
+from tests.sources.carmen_text import scans_of
+
+DATA = Path(os.environ.get("FCSLAM_DATA", "")) / "lidar"
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif("FCSLAM_DATA" not in os.environ, reason="needs the real logs: set FCSLAM_DATA"),
+]
+
+
+@pytest.mark.parametrize(
+    ("recording", "shape", "path_m", "duration_s", "laser_x_m"),
+    [
+        ("slam-benchmark/intel.clf.xz", (13631, 180), 508, 2691, 0.0),
+        ("slam-benchmark/fr079.clf.xz", (4934, 360), 392, 1061, -0.04),
+        ("slam-benchmark/mit-csail.clf.xz", (1988, 361), 374, 424, 0.0),
+        ("ual-campus/ual_2014_05_23.clf.xz", (3318, 361), 524, 181, 2.0),
+        ("wean-hall/robotdata1.log.gz", (713, 180), 41.2, 135, 0.25),
+        ("wean-hall/robotdata2.log.gz", (2251, 180), 87.2, 240, 0.25),
+        ("rosbag1/fr079.sort.bag", (4934, 360), 392, 1061, 0.04),
+        ("rosbag1/mit-csail.sort.bag", (1988, 361), 374, 424, 0.0),
+    ],
+)
+def test_recordings_hold_what_their_description_says(recording, shape, path_m, duration_s, laser_x_m):
+    source = open_source(DATA / recording)
+    survey = source.survey()
+    assert (survey.scan_count, survey.lasers[0].beam_count) == shape
+    assert survey.path_length_m == pytest.approx(path_m, rel=0.01)
+    assert survey.duration_s == pytest.approx(duration_s, abs=1.0)
+    assert survey.lasers[0].T_base_laser == pytest.approx((laser_x_m, 0.0, 0.0), abs=1e-4)
+    assert len(scans_of(source)) == shape[0]
+
+
+@pytest.mark.parametrize("bag", ["fr079", "mit-csail"])
+def test_published_bags_are_their_logs(bag):
+    source = open_source(DATA / f"rosbag1/{bag}.sort.bag")
+    assert source.survey().notes == ()
+    log = scans_of(open_source(DATA / f"slam-benchmark/{bag}.clf.xz"))
+    apart = np.array([a.T_odom_base - b.T_odom_base for a, b in zip(scans_of(source), log, strict=True)])
+    assert np.median(np.abs(apart)) < 0.01
+
+
+@pytest.mark.parametrize(("log", "name"), [("intel", "run.bag"), ("fr079", "run.mcap"), ("mit-csail", "run.db3")])
+def test_a_log_and_its_bag_are_the_same_to_the_last_bit(tmp_path, log, name):
+    """Also where the clock runs backwards (intel), and with odometry between the scans (fr079)."""
+    source = open_source(DATA / f"slam-benchmark/{log}.clf.xz")
+    write_bag(tmp_path / name, source.records())
+    bag = open_source(tmp_path / name)
+    assert bag.survey().lasers[0] == source.survey().lasers[0]
+    for before, after in zip(scans_of(source), scans_of(bag), strict=True):
+        assert after.stamp == before.stamp
+        assert after.T_odom_base.tolist() == before.T_odom_base.tolist()
+        beyond = before.ranges_m >= before.laser.max_range_m
+        np.testing.assert_array_equal(after.ranges_m, np.where(beyond, np.inf, before.ranges_m))
+    assert bag.faults[Fault.TIME_REVERSAL].count == source.faults[Fault.TIME_REVERSAL].count
+
+
+@pytest.mark.parametrize(("bag", "mean_m"), [("fr079", 0.07), ("mit-csail", 0.03)])
+def test_published_bags_map_well(tmp_path, capsys, bag, mean_m):
+    """The bag of fr079 says that the laser sits ahead of the base; the log says behind, and maps better."""
+    assert main(["map", str(DATA / f"rosbag1/{bag}.sort.bag"), "--output", str(tmp_path / "run")]) == 0
+    capsys.readouterr()
+    relations = DATA / f"slam-benchmark/{bag}.relations.gz"
+    assert main(["evaluate", "relations", str(tmp_path / "run"), str(relations), "--csv", str(tmp_path / "e.csv")]) == 0
+    rows = dict(line.split(",")[:2] for line in (tmp_path / "e.csv").read_text().splitlines())
+    assert float(rows["translation_error_mean"]) < mean_m
+
+
+def test_intel_goes_back_in_time():
+    source = open_source(DATA / "slam-benchmark/intel.clf.xz")
+    for _ in source.records():
+        pass
+    assert source.faults[Fault.TIME_REVERSAL].count == 631
+    assert source.faults[Fault.TIME_REVERSAL].largest_s == pytest.approx(0.9, abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["intel", "fr079", "mit-csail"])
+@pytest.mark.parametrize("parts", [1, 3])
+def test_every_relation_names_a_scan(name, parts):
+    source = open_source(DATA / f"slam-benchmark/{name}.clf.xz")
+    robots = [source] if parts == 1 else split(source, parts)
+    stamps = np.sort([scan.stamp for robot in robots for scan in scans_of(robot)])
+    with gzip.open(DATA / f"slam-benchmark/{name}.relations.gz", "rt") as lines:
+        named = np.array([line.split()[:2] for line in lines], dtype=np.float64).ravel()
+    after = np.searchsorted(stamps, named).clip(1, len(stamps) - 1)
+    distance = np.minimum(abs(stamps[after] - named), abs(stamps[after - 1] - named))
+    assert distance.max() < 6e-6, "relations may be printed with five digits"
+
+
+@pytest.mark.parametrize("log", sorted(DATA.glob("rbpf-corrected/*.log.gz")), ids=lambda path: path.name)
+def test_logs_without_a_usable_clock_are_read(log):
+    source = open_source(log)
+    assert len(scans_of(source)) == source.survey().scan_count > 200
