@@ -1,8 +1,7 @@
-"""Small synthetic graphs with known truth, and an independent Gauss-Newton solver."""
+"""Small synthetic graphs with known truth, and an independent solver."""
 
 import numpy as np
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import spsolve
+from scipy.optimize import least_squares
 
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
@@ -57,31 +56,15 @@ def manhattan(
     return PoseGraph(np.array(drifted), edges), truth, np.arange(len(edges)) < true_count
 
 
-def gauss_newton(graph: PoseGraph, poses: np.ndarray, rounds: int = 30) -> np.ndarray:
-    """Least-squares poses with variable 0 held, by numerical differentiation edge by edge: slow and plain."""
-    x = np.array(poses)
-    for _ in range(rounds):
-        rows, columns, entries, residuals = [], [], [], []
-        for number, edge in enumerate(graph.edges):
-            root = np.linalg.cholesky(edge.information).T
+def least_squares_poses(graph: PoseGraph, poses: np.ndarray) -> np.ndarray:
+    """Least-squares poses with variable 0 held, by SciPy's solver and numerical differentiation."""
+    edges = graph.arrays()
+    roots = np.linalg.cholesky(edges.information).transpose(0, 2, 1)
 
-            def residual(a: np.ndarray, b: np.ndarray, edge: Edge = edge, root: np.ndarray = root) -> np.ndarray:
-                return root @ se2.between(edge.T_i_j, se2.between(a, b))
+    def residuals(free: np.ndarray) -> np.ndarray:
+        x = np.vstack((poses[:1], free.reshape(-1, 3)))
+        errors = se2.between(edges.T_i_j, se2.between(x[edges.i], x[edges.j]))
+        return np.einsum("nab,nb->na", roots, errors).ravel()
 
-            residuals.append(residual(x[edge.i], x[edge.j]))
-            for axis in range(3):
-                h = 1e-6 * np.eye(3)[axis]
-                slopes = (
-                    (edge.i, residual(x[edge.i] + h, x[edge.j]) - residual(x[edge.i] - h, x[edge.j])),
-                    (edge.j, residual(x[edge.i], x[edge.j] + h) - residual(x[edge.i], x[edge.j] - h)),
-                )
-                for variable, slope in slopes:
-                    rows += [3 * number, 3 * number + 1, 3 * number + 2]
-                    columns += [3 * variable + axis] * 3
-                    entries += (slope / 2e-6).tolist()
-        J = csc_array((entries, (rows, columns)), shape=(3 * len(graph.edges), 3 * len(graph)))[:, 3:]
-        step = spsolve((J.T @ J).tocsc(), -J.T @ np.concatenate(residuals)).reshape(-1, 3)
-        x[1:] += step
-        if np.abs(step).max() < 1e-9:
-            break
-    return x
+    found = least_squares(residuals, poses[1:].ravel(), jac="3-point")
+    return np.vstack((poses[:1], found.x.reshape(-1, 3)))
