@@ -6,7 +6,6 @@ import pytest
 from evaluation.fleet_views import MatchViews, judge_views, lidar_overlap, read_fleet_views
 from evaluation.place_sets import read_place_set
 
-from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.records import (
     CameraImage,
@@ -143,15 +142,3 @@ def test_matches_are_judged_by_what_both_cameras_see(fleet):
     assert views[accepted] == MatchViews(same=1, different=1, judged=2)
     assert views[candidate].judged == 4
     assert views[candidate].same >= 2
-
-
-def test_what_is_no_fleet_with_cameras_is_refused(fleet, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("blind")
-    (folder / "simulation.yaml").write_text("seed: 1\n", encoding="utf-8")
-    with pytest.raises(InputError, match="0 recordings; a fleet is two"):
-        read_place_set(folder)
-    poses = np.full((3, 3), 1.0)
-    record(folder / "a", poses, None)
-    record(folder / "b", poses, None)
-    with pytest.raises(InputError, match="has no image whose pose is known"):
-        read_place_set(folder)

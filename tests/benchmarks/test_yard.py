@@ -100,17 +100,3 @@ def test_walls_are_met_where_lines_cross_them():
     for share in (0.3, 0.6, 0.9):
         between = np.array([x, y]) + share * (ends - np.array([x, y]))
         assert distances(between, bare.segments).min() > 1e-3
-
-
-def test_glass_returns_what_it_faces_and_else_lets_through_or_mirrors():
-    pane = ahead(YardKind.GLASS, 4.9)
-    assert scans(meadow(pane)) == pytest.approx(5.0, abs=0.01)
-    beside = Piece(YardKind.WALL, rectangle((9.0, 0.2), 0.0) + HERE[:2] + (0.0, 7.0))
-    room = meadow(pane, ahead(YardKind.WALL, 7.0, wide_m=14.0), beside)
-    laser = LaserModel(3, 0.499, 0.001, 30.0)
-    caster, rng = OutdoorRayCaster(room), np.random.default_rng(1)
-    found = np.array([caster.scan(HERE, laser, rng)[1] for _ in range(400)])
-    # The pane, what is behind it, and what stands beside the robot, seen in it.
-    shares = [np.mean(np.abs(found - at) < 0.1) for at in (5.0 / np.cos(0.5), 7.0 / np.cos(0.5), 6.9 / np.sin(0.5))]
-    assert shares == pytest.approx([0.2, 0.5, 0.3], abs=0.1)
-    assert sum(shares) > 0.98

@@ -161,19 +161,18 @@ def test_a_robot_whose_place_is_in_doubt_again_does_not_say_that_a_session_begin
     assert said == ["connected", "lost", "relocalized in map 0, quality 0.50", "not relocalized", "lost"]
 
 
+class Process:
+    """Notes what a learning process gets; a test of its own covers that."""
+
+    def __init__(self, told):
+        self.set_idle = told.append
+        self.close = lambda: told.append("closed")
+
+
 def test_a_live_robot_learns_while_it_stands_and_pauses_when_it_drives():
-    """The learning process gets each change; a test of its own covers it."""
     told = []
-
-    class Process:
-        def set_idle(self, is_idle):
-            told.append(is_idle)
-
-        def close(self):
-            told.append("closed")
-
     robot = SimpleNamespace(name="anna", idle=lambda: told.append("keyframes are placed"))
-    with live.standstill_learning(Process(), robot) as follow:
+    with live.standstill_learning(Process(told), robot) as follow:
         watch = live.pose_watch(told.append, follow)
         for scan in range(1, 30):
             x = 0.0 if scan < 20 else 1.0
@@ -212,18 +211,11 @@ def test_a_live_robot_that_is_turned_away_does_not_lose_its_run(monkeypatch, tmp
 def test_a_robot_that_is_turned_away_stops_learning_and_maps_on():
     told = []
 
-    class Process:
-        def set_idle(self, is_idle):
-            told.append(is_idle)
-
-        def close(self):
-            """Nothing to close."""
-
     def idle():
         raise CloudError("the token is not known (401)")
 
     robot = SimpleNamespace(name="anna", idle=idle)
-    with live.standstill_learning(Process(), robot) as follow:
+    with live.standstill_learning(Process(told), robot) as follow:
         for scan in range(1, 30):
             follow(SimpleNamespace(stamp=float(scan), T_odom_base=np.zeros(3), T_map_base=np.zeros(3)))
     assert True not in told

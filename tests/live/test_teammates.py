@@ -13,9 +13,8 @@ from fcslam.live.joint_map import JointMap
 from fcslam.live.map_poses import CorrectedOdometry
 from fcslam.live.teammates import OLDEST_S, beams_on_teammates
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
-from fcslam.records import Correction, Keyscan, KeyscanId, LaserModel, LaserScan, frozen
+from fcslam.records import Correction, Keyscan, LaserModel, LaserScan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.wire.messages import Hello, Packet
 from tests.lidar import worlds
 
 LASER = LaserModel(360, -math.pi, math.radians(1.0), 8.0)
@@ -184,26 +183,6 @@ def test_the_points_stay_in_the_scan_that_is_sent():
 def place(T_map_base):
     """Where the robot is in map 0, as far as the joint map asks."""
     return SimpleNamespace(T_map_base=np.asarray(T_map_base), map_index=0)
-
-
-def test_beams_are_those_of_the_laser_that_hit_the_teammate(joint):
-    """Two lasers scan at once; the keyscan of one loses nothing by what the other saw."""
-    scan, hit = scan_at(HERE, worlds.room(), (0.8, 0.2))
-    other = LaserModel(180, -math.pi, math.radians(2.0), 8.0)
-    fleet = Fleet(joint)
-    fleet.hear(mate(0.8, 0.2))
-    shown = JointMap(fleet, OccupancyConfig())
-    shown.mark_teammates(scan, 0, None)
-    assert np.array_equal(shown.mark_teammates(scan, 0, place(HERE)).on_teammates, hit)
-    keyscans = [
-        Keyscan(KeyscanId("a", 0), 0.0, frozen(np.full(180, 2.0), np.float32), laser=1),
-        Keyscan(KeyscanId("a", 0), 0.0, scan.ranges_m, laser=0),
-    ]
-    packets = [Packet("a", 0, k, 0.0, body) for k, body in enumerate([Hello("a", 0, (LASER, other), {}), *keyscans])]
-    shown.add(packets)
-    seen, marked = (one.on_teammates for one in shown._drawn)
-    assert seen is None
-    assert np.array_equal(marked, hit)
 
 
 def test_the_first_scan_of_a_session_is_not_placed_by_the_odometry_of_the_one_before(joint):

@@ -1,25 +1,19 @@
 """A robot closes its own loops by their looks: however far it drifted, and never with a similar place elsewhere."""
 
 from functools import lru_cache
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.lidar.backend import LidarBackend
 from fcslam.lidar.closing import LoopCloser
-from fcslam.lidar.frontend import LidarConfig, LidarFrontend
-from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.tracker import TrackedScan
 from fcslam.robot.own_places import OwnPlaces
-from tests.lidar.worlds import box, path, recording, scan_at, shifted
+from tests.lidar.worlds import box, path, scan_at, shifted
 
 pytestmark = pytest.mark.slow
 
 STEP_M = 1.0
-FINE_M = 0.5
 RADIUS_M = 32.0
 VEER_RAD_M = 0.006
 """Over a loop of 200 m the heading is wrong by 69 deg and the position by 35 m."""
@@ -114,42 +108,3 @@ def test_what_is_forgotten_is_not_recognised():
 def test_places_that_look_alike_do_not_close_a_loop():
     truth, submaps = submaps_of(equal_doors, 180.0)
     assert closures(submaps, list(truth), own_places()) == []
-
-
-class VeeringTracker:
-    """Tracks every scan, sure of itself, along given poses."""
-
-    def __init__(self, poses):
-        self._poses = iter(poses)
-
-    def localize(self, scan):
-        points = point_scan(scan.ranges_m, scan.laser)
-        return SimpleNamespace(tracked=TrackedScan(next(self._poses), np.diag((1e4, 1e4, 1e5)), points))
-
-    def commit(self, tracking):
-        pass
-
-    def insert(self, points, T_local_base, lasers):
-        pass
-
-
-def test_the_map_closes_with_its_loop():
-    """25 m of drift and more bend into shape: the robust solve must not take the loop for the outlier."""
-    truth = lap(225.0, FINE_M)
-    poses = veering(truth)
-    frontend = LidarFrontend("r", LidarConfig())
-    backend = LidarBackend("r", LidarConfig(), own_places())
-    frontend._tracker = VeeringTracker(poses)
-    segments = blocks()
-    for k, pose in enumerate(poses):
-        backend.add(frontend.process(*recording(truth[k : k + 1], [pose], segments, seed=k)).keyscan)
-    backend.finish()
-    end = int(2 * np.pi * RADIUS_M / FINE_M)
-
-    def off_m(moved):
-        off = se2.between(se2.between(truth[0], truth[end]), moved)
-        return np.hypot(off[0], off[1])
-
-    assert off_m(se2.between(poses[0], poses[end])) > 25.0
-    closed = backend.keyscan_poses()
-    assert off_m(se2.between(closed[0], closed[end])) < 0.3

@@ -9,9 +9,7 @@ pytest.importorskip("torch", reason="needs fcslam[federated]")
 from fcslam.learning.federated.screening import (
     BOUNDS,
     ScreeningBounds,
-    agreements,
     screen,
-    statistics_distances,
     update_length,
 )
 
@@ -109,25 +107,6 @@ def test_even_few_robots_are_safe_from_what_nobody_could_mean(kind, others):
 def test_two_that_disagree_are_not_judged():
     answers = {"a": honest(1), "b": poisoned("flipped")}
     assert screen(answers, BEFORE, BOUNDS) == {}
-
-
-def test_agreement_is_a_cosine_with_the_mean_direction_of_the_others():
-    x, across = np.array([3.0, 4.0]), np.array([-4.0, 3.0])
-    assert agreements([x, 2 * x, 100 * x]) == pytest.approx([1.0, 1.0, 1.0])
-    assert agreements([x, -5 * x]) == pytest.approx([-1.0, -1.0])
-    assert agreements([across, x, 100 * x]) == pytest.approx([0.0, np.sqrt(0.5), np.sqrt(0.5)])
-    assert agreements([np.zeros(2), x, x]) == pytest.approx([0.0, 1.0, 1.0])
-
-
-def test_the_distance_of_statistics_counts_standard_deviations():
-    def network(mean, variance):
-        return {"n.running_mean": np.full(3, mean, np.float32), "n.running_var": np.full(3, variance, np.float32)}
-
-    same, shifted, wider = statistics_distances([network(1.0, 4.0), network(3.0, 4.0), network(1.0, 4.0 * np.e**2)])
-    assert same == pytest.approx(np.zeros(3))
-    assert shifted == pytest.approx(np.ones(3), rel=1e-4)
-    assert wider == pytest.approx(np.ones(3), rel=1e-4)
-    assert statistics_distances([{"a.weight": np.ones(2, np.float32)}])[0].shape == (0,)
 
 
 def seen(seed, **changed):
