@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
-from fcslam.geometry.rotations import rotation_matrix
 from fcslam.lab.simulation.floorplan import WALL_M, FloorPlan, Room
 from fcslam.records import CameraModel, FloatArray, TagFamily
 
@@ -70,7 +69,7 @@ def draw_tags(
     """
     import cv2
 
-    R_base_camera = rotation_matrix(camera.T_base_camera.rotation)
+    R_base_camera = camera.T_base_camera.rotation_matrix()
     eye = np.array(camera.T_base_camera.translation_m)
     for tag in tags:
         T_base_tag = se2.between(T_building_base, np.array(tag.T_building_tag))

@@ -203,6 +203,17 @@ class Transform(NamedTuple):
     rotation: tuple[float, float, float, float]
     """Unit quaternion (x, y, z, w)."""
 
+    def rotation_matrix(self) -> FloatArray:
+        """The rotation, shape (3, 3)."""
+        x, y, z, w = self.rotation
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:

@@ -221,9 +221,7 @@ def _decompressor(compression: str) -> Any:
 
 def check_image(encoded: bytes) -> None:
     """Check the size of an image by its header, before its pixels are decoded; an unknown format is a ValueError."""
-    width, height, pixel_bytes = (
-        _png_size(encoded) if encoded.startswith(b"\x89PNG\r\n\x1a\n") else _image_size(encoded)
-    )
+    width, height, pixel_bytes = image_size(encoded)
     most = most_unpacked(len(encoded))
     if width * height * pixel_bytes > most:
         raise LimitError(
@@ -231,14 +229,11 @@ def check_image(encoded: bytes) -> None:
         )
 
 
-def _png_size(encoded: bytes) -> tuple[int, int, int]:
-    """Width, height and bytes of a pixel by the header, which Pillow does not read of large maps."""
-    width, height, depth, kind = struct.unpack_from(">IIBB", encoded.ljust(26, b"\0"), 16)
-    return width, height, 4 * (depth // 8 or 1) if kind else depth // 8 or 1
-
-
-def _image_size(encoded: bytes) -> tuple[int, int, int]:
-    """Width, height and bytes of a pixel by the header."""
+def image_size(encoded: bytes) -> tuple[int, int, int]:
+    """Width, height and bytes of a pixel by the header of an image; an unknown format is a ValueError."""
+    if encoded.startswith(b"\x89PNG\r\n\x1a\n"):  # Pillow does not read that of large maps
+        width, height, depth, kind = struct.unpack_from(">IIBB", encoded.ljust(26, b"\0"), 16)
+        return width, height, 4 * (depth // 8 or 1) if kind else depth // 8 or 1
     from PIL import Image
 
     try:

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from fcslam.records import Transform
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, mounting, planar, rotated, transform_of
 
 lengths = st.floats(-10, 10)
@@ -17,6 +18,13 @@ quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm
 
 def unit(q):
     return tuple(float(value) for value in np.array(q) / np.linalg.norm(q))
+
+
+@given(quaternions)
+def test_the_matrix_of_a_rotation(quaternion):
+    expected = Rotation.from_quat(quaternion).as_matrix()
+    matrix = Transform((0.0, 0.0, 0.0), unit(quaternion)).rotation_matrix()
+    np.testing.assert_allclose(matrix, expected, atol=1e-12)
 
 
 @st.composite

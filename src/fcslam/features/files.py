@@ -12,7 +12,6 @@ import numpy as np
 from fcslam.errors import FeatureError, writing
 from fcslam.features.detector import FeatureDetector, GreyImage, ImageFeatures, decode_grey, in_original, shrink
 from fcslam.records import CODE_BYTES, frozen
-from fcslam.sources.images import MAX_SIDE_PX, image_size
 from fcslam.storage.files import replacing
 from fcslam.untrusted import Arrays, read_arrays, read_bytes
 
@@ -29,8 +28,6 @@ def read_grey(path: Path) -> GreyImage:
         encoded = read_bytes(path, most=1 << 28)
     except OSError as error:
         raise FeatureError(f"{path}: cannot be read ({error})") from error
-    if _longer_side(encoded) > MAX_SIDE_PX:
-        raise FeatureError(f"{path}: an image has at most {MAX_SIDE_PX} pixels a side")
     image = decode_grey(encoded)
     if image is None or not image.size:
         raise FeatureError(f"{path}: cannot be read as an image; give JPEG, PNG, PPM or TIFF")
@@ -76,14 +73,6 @@ def read_features(path: Path) -> tuple[ImageFeatures, tuple[int, int]]:
         frozen(keypoints[order], np.float32), frozen(scores[order], np.float32), frozen(descriptors[order], np.uint8)
     )
     return features, (int(size[0]), int(size[1]))
-
-
-def _longer_side(encoded: bytes) -> int:
-    """Longer side in pixels, read from the header without decoding; 0 if the file is neither JPEG nor PNG."""
-    try:
-        return max(image_size(encoded))
-    except ValueError:
-        return 0
 
 
 def find_files(images: Path) -> list[Path]:

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.compiled import njit
-from fcslam.geometry.rotations import rotation_matrix
 from fcslam.records import CameraModel, FloatArray
 
 CEILING_M = 3.0
@@ -76,7 +75,7 @@ def locate_among(
 
 def project(positions: FloatArray, camera: CameraModel) -> FloatArray:
     """Pixels (K, 2) of positions (K, 3) in ``base``, metres, wherever they are; NaN behind the camera."""
-    seen = (positions - camera.T_base_camera.translation_m) @ rotation_matrix(camera.T_base_camera.rotation)
+    seen = (positions - camera.T_base_camera.translation_m) @ camera.T_base_camera.rotation_matrix()
     depth = np.where(seen[:, 2] > 0.0, seen[:, 2], np.nan)
     return np.column_stack((camera.fx * seen[:, 0] / depth + camera.cx, camera.fy * seen[:, 1] / depth + camera.cy))
 
@@ -85,7 +84,7 @@ def _rays(keypoints_px: FloatArray, camera: CameraModel) -> FloatArray:
     """Directions of the viewing rays in ``base``, shape (K, 3)."""
     x = (keypoints_px[:, 0] - camera.cx) / camera.fx
     y = (keypoints_px[:, 1] - camera.cy) / camera.fy
-    return np.column_stack((x, y, np.ones(len(x)))) @ rotation_matrix(camera.T_base_camera.rotation).T
+    return np.column_stack((x, y, np.ones(len(x)))) @ camera.T_base_camera.rotation_matrix().T
 
 
 @njit

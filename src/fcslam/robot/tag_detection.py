@@ -10,7 +10,6 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.features.detector import GreyImage, decode_grey
 from fcslam.geometry import se2
-from fcslam.geometry.rotations import rotation_matrix
 from fcslam.records import CameraImage, CameraModel, FloatArray, KeyscanId, Tag, TagFamily, TagSighting, frozen
 
 EDGE_SIGMA_PX, CORNER_SIGMA_PX = 0.3, 1.5
@@ -111,7 +110,7 @@ def tag_in_base(
     from scipy.optimize import approx_fprime, least_squares  # most images show no tag
 
     matrix = np.array(((camera.fx, 0.0, camera.cx), (0.0, camera.fy, camera.cy), (0.0, 0.0, 1.0)))
-    R_base_camera = rotation_matrix(camera.T_base_camera.rotation)
+    R_base_camera = camera.T_base_camera.rotation_matrix()
     offset = np.array(camera.T_base_camera.translation_m)
 
     def normal(pose: FloatArray) -> FloatArray:

@@ -107,9 +107,9 @@ class ScanWatch:
         if np.isnan(scan.T_odom_base).any():
             return
         rest = self._at_rest.get(scan.laser.T_base_laser)
-        if rest is None or not stands_still(rest, scan):
+        if rest is None or rest.laser != scan.laser or not stands_still(rest, scan):
             self._at_rest[scan.laser.T_base_laser] = scan
-        elif _changed_share(rest, scan) > CHANGED:
+        elif changed_share(rest.ranges_m, scan.ranges_m, scan.laser.max_range_m) > CHANGED:
             self._audit.add(Fault.FROZEN_ODOMETRY, number)
 
 
@@ -137,15 +137,6 @@ def stands_still(before: LaserScan, after: LaserScan) -> bool:
     """Whether the odometry stood still between two scans; false without odometry."""
     (x0, y0, theta0), (x1, y1, theta1) = before.T_odom_base.tolist(), after.T_odom_base.tolist()
     return hypot(x1 - x0, y1 - y0) < STILL_M and abs(remainder(theta1 - theta0, tau)) < STILL_RAD
-
-
-def _changed_share(before: LaserScan, after: LaserScan) -> float:
-    laser, was = after.laser, before.laser
-    beams = np.rint((laser.angles_rad() - was.angle_min_rad) / was.angle_increment_rad).astype(np.intp)
-    inside = (beams >= 0) & (beams < was.beam_count)
-    return changed_share(
-        before.ranges_m[beams[inside]], after.ranges_m[inside], min(was.max_range_m, laser.max_range_m)
-    )
 
 
 def changed_share(before_m: Ranges, after_m: Ranges, max_range_m: float = inf) -> float:

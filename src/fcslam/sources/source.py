@@ -54,20 +54,16 @@ class Source(Protocol):
         """Faults of the latest pass of ``records`` so far; complete when the pass has ended."""
 
     def survey(self, scans: ScanRange = WHOLE) -> Survey:
-        """Summarise ``scans`` in one quick pass, and reject a recording that cannot be mapped.
+        """Summarise ``scans`` in one quick pass.
 
         Raises:
-            SourceError: the archive is truncated, or most of the recording is damaged. Or there are no laser scans, no
-                odometry, mostly scans of another laser than the first ones, or time jumps back.
+            SourceError: the recording is damaged, or cannot be mapped.
         """
 
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """Stream scans, odometry and images in file order; other records belong to the scan before them.
 
-        Memory use does not depend on the recording's length. Every call starts a new pass.
-
-        Raises:
-            SourceError: as in ``survey``.
+        Memory use does not depend on the recording's length. Every call starts a new pass. Raises as ``survey``.
         """
 
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.geometry.rotations import rotation_matrix
 from fcslam.lab.simulation.decoration import Light
 from fcslam.lab.simulation.engine import GL_LOCK, gl_context, mujoco
 from fcslam.lab.simulation.scene import SEEN, SOLID
@@ -139,7 +138,7 @@ class Camera:
 def _matrix(camera: CameraModel) -> FloatArray:
     """``T_base_camera`` as a matrix (4, 4)."""
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation_matrix(camera.T_base_camera.rotation)
+    matrix[:3, :3] = camera.T_base_camera.rotation_matrix()
     matrix[:3, 3] = camera.T_base_camera.translation_m
     return matrix
 

@@ -7,8 +7,13 @@ import numpy as np
 from fcslam.records import CameraModel, Transform
 from fcslam.sources.bags.codec import COMPRESSED_IMAGE
 from fcslam.sources.bags.messages import header_of
-from fcslam.sources.images import MAX_SIDE_PX, check_camera, image_suffix
+from fcslam.untrusted import image_size
 
+MAX_IMAGE_BYTES = 1 << 25
+MAX_SIDE_PX = 1 << 14
+_FAR_PX = 1e6
+"""Bound of intrinsics."""
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
 _FASTEST = 1
 """Fastest PNG compression level, because images are compressed while the bag is read."""
@@ -48,12 +53,12 @@ def image_of(content: Any, kind: str, bag_time_ns: int) -> ImageMessage:
         encoded = np.asarray(content.data, dtype=np.uint8).tobytes()
         image_suffix(encoded)
     else:
-        encoded = _png(content)
+        encoded = _encoded_png(content)
     stamp, _ = header_of(content.header, bag_time_ns)
     return ImageMessage(stamp, encoded)
 
 
-def _png(content: Any) -> bytes:
+def _encoded_png(content: Any) -> bytes:
     import cv2
 
     channels, width, height, step = _CHANNELS.get(content.encoding), content.width, content.height, content.step
@@ -77,6 +82,26 @@ def calibration_of(content: Any) -> Calibration:
     D = np.asarray(content.d if hasattr(content, "d") else content.D, dtype=np.float64)
     _, frame = header_of(content.header, 0)
     fx, cx, fy, cy = (float(K[at]) for at in (0, 2, 4, 5))
-    calibration = Calibration(frame, content.width, content.height, fx, fy, cx, cy, bool(np.any(D)))
-    check_camera(calibration.camera(Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))))
-    return calibration
+    if not (0 < content.width <= MAX_SIDE_PX and 0 < content.height <= MAX_SIDE_PX):
+        raise ValueError(f"width and height must be 1 to {MAX_SIDE_PX} pixels")
+    if not (0.0 < fx < _FAR_PX and 0.0 < fy < _FAR_PX and abs(cx) < _FAR_PX and abs(cy) < _FAR_PX):
+        raise ValueError("fx, fy, cx and cy must be numbers of pixels, the first two positive")
+    return Calibration(frame, content.width, content.height, fx, fy, cx, cy, bool(np.any(D)))
+
+
+def image_suffix(encoded: bytes) -> str:
+    """``jpg`` or ``png`` by the first bytes; raises ValueError for anything else."""
+    if encoded.startswith(_JPEG):
+        return "jpg"
+    if encoded.startswith(_PNG):
+        return "png"
+    raise ValueError("neither JPEG nor PNG")
+
+
+def check_image(encoded: bytes, camera: CameraModel) -> None:
+    """Raises ValueError if ``encoded`` is not an image of ``camera``."""
+    if len(encoded) > MAX_IMAGE_BYTES:
+        raise ValueError(f"an image has at most {MAX_IMAGE_BYTES} bytes")
+    width, height, _ = image_size(encoded)
+    if (width, height) != (camera.width, camera.height):
+        raise ValueError(f"the image has {width} x {height} pixels, its camera {camera.width} x {camera.height}")

@@ -5,12 +5,11 @@ from typing import Any, Final
 import numpy as np
 
 from fcslam.records import FloatArray, Transform
-from fcslam.sources.bags.camera import Calibration
+from fcslam.sources.bags.camera import MAX_SIDE_PX, Calibration
 from fcslam.sources.bags.codec import IMAGE, POINT_CLOUD
 from fcslam.sources.bags.messages import LONGEST_SWEEP_S, header_of
 from fcslam.sources.bags.options import GivenPose
 from fcslam.sources.bags.transforms import in_space, planar, rotated
-from fcslam.sources.images import MAX_SIDE_PX
 from fcslam.sources.point_clouds import CloudMounting, PointCloud, depth_points
 
 MOST_POINTS: Final = 4_000_000

@@ -10,7 +10,7 @@ import numpy as np
 
 from fcslam.errors import InputError
 from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, frozen
-from fcslam.sources.bags.camera import Calibration
+from fcslam.sources.bags.camera import Calibration, check_image
 from fcslam.sources.bags.codec import LASER_SCANS, SCANS
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, ScanMessage, measured_ranges, reversed_sweep
@@ -18,7 +18,6 @@ from fcslam.sources.bags.options import GivenPose
 from fcslam.sources.bags.pairing import PosedImage, PosedScan
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
 from fcslam.sources.gate import usual_beams
-from fcslam.sources.images import check_image
 from fcslam.sources.point_clouds import CloudBand
 
 _LEVEL_RAD = radians(2.0)

@@ -19,6 +19,7 @@ from fcslam.records import (
     SensorRecord,
     Transform,
 )
+from fcslam.sources.bags.camera import image_suffix
 from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -31,7 +32,6 @@ from fcslam.sources.bags.codec import (
     full_name,
 )
 from fcslam.sources.bags.transforms import in_space
-from fcslam.sources.images import image_suffix
 
 if TYPE_CHECKING:
     from rosbags.rosbag1 import Writer as Writer1
