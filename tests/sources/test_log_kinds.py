@@ -63,7 +63,7 @@ def test_raw_scans_beside_others_are_passed_over(tmp_path):
 
 def test_lines_that_are_no_scans_are_named(tmp_path):
     lines = [line for k in range(5) for line in (odom(k, pose_at(k)), "RLASER 1 2 3", "TRUEPOS 1 2 3")]
-    with pytest.raises(SourceError, match=r"its lines are 5 ODOM, 5 RLASER, 5 TRUEPOS; give a log with scans"):
+    with pytest.raises(SourceError, match=r"no laser scan in this CARMEN log; give a log with scans"):
         open_source(save(tmp_path / "run.log", lines)).survey()
 
 

@@ -28,8 +28,6 @@ _OTHERS: tuple[tuple[int, bytes, str], ...] = (
     (0, b"/annex/objects/", "is a pointer of git-annex and not the recording; fetch that by `git annex get`"),
     (0, b"<!DOCTYPE", "is a web page and not the recording; download that again"),
     (0, b"<html", "is a web page and not the recording; download that again"),
-    (0, b"\xff\xfe", "is text in UTF-16; convert it by `iconv -f UTF-16 -t UTF-8`"),
-    (0, b"\xfe\xff", "is text in UTF-16; convert it by `iconv -f UTF-16 -t UTF-8`"),
 )
 """Where other files have which bytes, and what they are and what to do."""
 _FEW_BYTES = 512
@@ -145,8 +143,6 @@ def _refuse_others(path: Path, content: bytes) -> None:
     for at, magic, what in _OTHERS:
         if content.startswith(magic, at):
             raise SourceError(f"{path}: {what}")
-    if b"\r" in content and not (b"\n" in content or b"\0" in content):
-        raise SourceError(f"{path}: has lines that end with CR alone; convert them by `tr '\\r' '\\n'`")
     if not content:
         for file in filter(Path.is_file, (*path.glob("*.mcap"), *path.glob("*.db3"))):
             with translate_errors(file), open_file(file) as stream:

@@ -23,7 +23,7 @@ from fcslam.sources.faults import FEWEST, Audit, Fault, Faults
 from fcslam.sources.source import WHOLE, ScanRange
 
 MAX_STEP_BACK_S = 2.0
-"""Largest tolerated step back in time."""
+"""Largest tolerated step back in time; the messages of one clock are recorded within it of each other's delay."""
 TOLERATED_SHARE = 0.01
 """Largest share of inconsistent scans in a recording."""
 FIRST_MESSAGES = 20

@@ -11,13 +11,14 @@ from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odom
 from fcslam.sources.bags.census import DecodedBag
 from fcslam.sources.bags.codec import SCANS
 from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.bags.pairing import MAX_GAP_S
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.bags.transforms import Link
 from fcslam.sources.formats import format_of, open_source, robot_in
 from fcslam.sources.source import Source
 
-GAP_S, GAP_INTERVALS = 1.0, 5.0
-"""A longer time without a scan, in seconds and in usual intervals between scans, is a gap."""
+GAP_INTERVALS = 5.0
+"""A time without a scan that is longer than ``MAX_GAP_S`` and so many usual intervals between scans is a gap."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,5 +172,5 @@ def _rate_hz(stamps: list[float]) -> float | None:
 def _gaps(stamps: list[float]) -> tuple[Gap, ...]:
     ordered = np.sort(stamps)
     steps_s = np.diff(ordered)
-    limit_s = max(GAP_S, GAP_INTERVALS * float(np.median(steps_s))) if len(steps_s) else np.inf
+    limit_s = max(MAX_GAP_S, GAP_INTERVALS * float(np.median(steps_s))) if len(steps_s) else np.inf
     return tuple(Gap(float(ordered[k] - ordered[0]), float(steps_s[k])) for k in np.flatnonzero(steps_s > limit_s))

@@ -19,6 +19,7 @@ import numpy as np
 from fcslam.errors import SourceError
 from fcslam.records import FloatArray, LaserScan, Ranges, frozen
 from fcslam.sources.faults import FEWEST
+from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.pose import Pose
 
 FEWEST_RETURNS = 0.02
@@ -35,9 +36,10 @@ _REPEATED, _PLACES = 0.1, 0.5
 """Share of the beams that have a placeholder, and of the places at which as many have it."""
 _NEAR, _ABOVE_NEAR = 2, 5
 """How many values to each side are near another, and how many times more frequent than these a placeholder is."""
-_FIRST, _KEPT = 20, 256
-"""Scans that are kept wherever they are from, and most that are kept."""
-_APART_M, _APART_RAD = 0.3, 0.3
+_KEPT = 256
+"""Most scans that are kept."""
+_APART = 0.3
+"""Metres or radians between two places."""
 
 
 _AT_FLOOR, _ASIDE = 0.88, 0.17
@@ -88,7 +90,7 @@ class RangeSample:
 
     def wants(self, T_odom_base: Pose) -> bool:
         """Whether to add the next scan."""
-        if self._last is not None and self._seen >= _FIRST and not is_apart(self._last, T_odom_base):
+        if self._last is not None and self._seen >= FIRST_MESSAGES and not is_apart(self._last, T_odom_base):
             return False
         self._seen += 1
         return self._seen % self._step == 0
@@ -179,7 +181,7 @@ def placeholder_note(path: Path, placeholders: Sequence[float], which: str) -> l
 
 def is_apart(a: Pose, b: Pose) -> bool:
     """Whether a robot at these poses sees the building from different places."""
-    return hypot(b[0] - a[0], b[1] - a[1]) > _APART_M or abs(remainder(b[2] - a[2], tau)) > _APART_RAD
+    return hypot(b[0] - a[0], b[1] - a[1]) > _APART or abs(remainder(b[2] - a[2], tau)) > _APART
 
 
 def _returns(sample: _Sample) -> FloatArray:

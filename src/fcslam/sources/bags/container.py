@@ -10,15 +10,15 @@ from tempfile import mkdtemp
 from typing import BinaryIO, NamedTuple
 from weakref import finalize
 
+from fcslam.config import one_line
 from fcslam.errors import SourceError
-from fcslam.sources.bags.codec import OLD_TRANSFORMS, TRANSFORMS
+from fcslam.sources.bags.codec import NANOSECONDS, OLD_TRANSFORMS, TRANSFORMS
 from fcslam.sources.bags.records import MCAP_MAGIC, ROS1_MAGIC, SQLITE_MAGIC, DatabaseFile, RecordFile
 from fcslam.sources.logs.archive import translate_errors
 from fcslam.untrusted import open_file, open_zstd
 
 _METADATA, _ZSTD_SUFFIX = "metadata.yaml", ".zstd"
 _SUFFIXES = (".mcap", ".db3", ".bag", ".active")
-_LONGEST_REASON = 200
 _REMEDIES = {
     ROS1_MAGIC: "copy it again, or mend it with `rosbag reindex`",
     MCAP_MAGIC: "copy it again, or mend it with `mcap recover`",
@@ -26,7 +26,7 @@ _REMEDIES = {
 }
 ZSTD = b"\x28\xb5\x2f\xfd"
 """The first bytes of a file or message in zstd."""
-_LONGEST_PAUSE_NS, _LONGEST_OVERLAP_NS = 60 * 10**9, 10**9
+_LONGEST_PAUSE_NS, _LONGEST_OVERLAP_NS = 60 * NANOSECONDS, NANOSECONDS
 """Of the scans in two parts of one recording, from the end of one to the beginning of the next."""
 
 
@@ -114,7 +114,7 @@ class BagPart:
 
     def refusal(self, error: object) -> SourceError:
         """The error of a file that cannot be read."""
-        reason = " ".join(str(error).split())[:_LONGEST_REASON].rstrip(".") or type(error).__name__
+        reason = one_line(str(error)).rstrip(".") or type(error).__name__
         return SourceError(f"{self.path}: the bag cannot be read ({reason}); {self._remedy}")
 
     @contextmanager

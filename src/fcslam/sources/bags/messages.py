@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fcslam.geometry.beams import FULL_TURN_RAD, SAME_VIEW_BEAMS, is_field_of_view
+from fcslam.geometry.beams import FULL_TURN_RAD, ROUNDING, SAME_VIEW_BEAMS, is_field_of_view
 from fcslam.records import Beams, Ranges, Sweep, Transform
 from fcslam.sources.bags.codec import NANOSECONDS
 from fcslam.sources.bags.transforms import planar, transform_of
@@ -18,8 +18,6 @@ SHORTEST_SWEEP_S, LONGEST_SWEEP_S = 1e-4, 1.0
 """A scan that takes less is one at once; no scanner takes longer for a turn, so a larger time increment is wrong."""
 _OVER_SCAN_TIME = 1.2
 """Largest ratio of the time of all beams to the time between scans; some drivers state a wrong time increment."""
-_COUNT_TOLERANCE = 0.01
-"""Share of the ranges by which drivers that round the increment are wrong."""
 LONGEST_NAME = 255
 """Characters in the name of a topic or a frame, as in ROS 2."""
 
@@ -126,7 +124,7 @@ def _check_angles(count: int, first_rad: float, increment_rad: float, last_rad: 
     stated = (last_rad - first_rad) / increment_rad + 1.0
     if stated < 1.0:
         raise BeamsError("angle_increment leads away from angle_max")
-    if abs(stated - count) > max(SAME_VIEW_BEAMS, _COUNT_TOLERANCE * count):
+    if abs(stated - count) > max(SAME_VIEW_BEAMS, ROUNDING * count):
         raise BeamsError(f"{count} ranges, but the angles are those of {stated:.0f}")
 
 

@@ -23,7 +23,7 @@ from fcslam.sources.bags.sectors import are_sectors, cloud_sector_rad, joined_tu
 from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree
 from fcslam.sources.contradictions import CHANGED, changed_share
-from fcslam.sources.gate import FIRST_MESSAGES
+from fcslam.sources.gate import FIRST_MESSAGES, MAX_STEP_BACK_S
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
 from fcslam.sources.point_clouds import CloudBand
 
@@ -31,8 +31,6 @@ _IMAGES_TRIED = 5
 _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
 _FEWEST_LAGS = 4
-_LARGEST_DELAY_S = 2.0
-"""Messages of one clock are recorded within this time of each other's delay."""
 
 
 class OdometryInput(NamedTuple):
@@ -226,7 +224,7 @@ class _Planner:
         band = self._options.cloud_band
         scans_s = self._lag_s(self._topics.scans[:1], lambda message: [self._scans.scan(message, band).end])
         odometry_s = self._lag_s(odometry.topics, lambda message: [each.stamp for each in odometry.readings(message)])
-        if scans_s is None or odometry_s is None or abs(scans_s - odometry_s) < _LARGEST_DELAY_S:
+        if scans_s is None or odometry_s is None or abs(scans_s - odometry_s) < MAX_STEP_BACK_S:
             return 0.0
         self._notes.append(
             f"{self._path}: the clock of {odometry.name} is {scans_s - odometry_s:.3f} s ahead of that of the scans by "
@@ -244,7 +242,7 @@ class _Planner:
         if len(lags_s) < _FEWEST_LAGS:
             return None
         low_s, middle_s, high_s = quantiles(lags_s, n=4)
-        return middle_s if high_s - low_s <= _LARGEST_DELAY_S else None
+        return middle_s if high_s - low_s <= MAX_STEP_BACK_S else None
 
     def _has_images(self, topic: Topic) -> bool:
         images = valid(

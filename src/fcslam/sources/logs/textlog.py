@@ -7,7 +7,6 @@ Besides the rules of ``gate``:
 - Poses that say nothing (``PathSummary.fault``) are not odometry.
 """
 
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cached_property
 from math import isnan
@@ -16,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fcslam.config import one_line
 from fcslam.errors import SourceError
 from fcslam.records import Beams, FloatArray, LaserScan, Odometry, SensorRecord, frozen
 from fcslam.sources.contradictions import ScanWatch
@@ -35,7 +33,6 @@ KEPT_BYTES = 1 << 25
 
 NumberedLine = tuple[int, Line | None]
 """A line with its number, counted from 1; None if it is broken."""
-_WORDS_NAMED = 5
 UNTIMED_STEP_S = 1.0
 """Time between the scans of a log that states none."""
 
@@ -146,16 +143,8 @@ class TextLog:
                 break
         if not scans:
             seen = f"; {audit.faults()}" if audit.faults() else ""
-            raise SourceError(
-                f"{self._path}: no laser scan in this CARMEN log{seen}; its lines are {self._kinds()}; "
-                "give a log with scans"
-            )
+            raise SourceError(f"{self._path}: no laser scan in this CARMEN log{seen}; give a log with scans")
         return usual_log_beams(scans, self._parameters)
-
-    def _kinds(self) -> str:
-        words = (text.split(None, 1)[:1] for _, text in numbered_lines(self._path))
-        counts = Counter(word[0].decode("ascii", "replace") for word in words if word)
-        return ", ".join(f"{count} {one_line(word)}" for word, count in counts.most_common(_WORDS_NAMED))
 
     def _all_lines(self) -> Iterable[NumberedLine]:
         return self._kept or self._parsed()
