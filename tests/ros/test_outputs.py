@@ -5,8 +5,8 @@ import pytest
 
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import frozen
+from fcslam.ros.clock import TransformStream
 from fcslam.ros.outputs import Outputs
-from fcslam.ros.transform_stream import TransformStream
 from tests.ros.memory_network import MemoryNetwork
 
 SECOND = 10**9

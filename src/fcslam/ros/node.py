@@ -17,7 +17,7 @@ from fcslam.config import one_line
 from fcslam.errors import FcslamError, InputError
 from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
 from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
-from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock
+from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock, TransformStream
 from fcslam.ros.inbox import POLL_S, Inbox
 from fcslam.ros.live_plan import Notify
 from fcslam.ros.network import Endpoint, Quality, RosNetwork
@@ -25,7 +25,6 @@ from fcslam.ros.outputs import MAP, OWN_MAP, POSE, Outputs, nanoseconds
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.sensors import LiveSensors
 from fcslam.ros.topics import SensorTopics, choose_sensor_topics, resolved
-from fcslam.ros.transform_stream import TransformStream
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, LASER_SCANS, SCANS, MessageCodec
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.transforms import planar, transform_of

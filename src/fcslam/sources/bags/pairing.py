@@ -90,8 +90,14 @@ class OdometryPairing:
             if self._is_late(item.stamp):
                 _insert(readings, item)
             elif self._updates.is_fresh(item.stamp, item.T_odom_base):
-                _assign_poses(queue, readings[-1] if readings else None, item)
+                around = [readings[-1], item] if readings else [item]
+                steps_back = item.stamp < around[0].stamp
                 readings.append(item)
+                for waiting in queue:
+                    stamp = waiting.item.stamp
+                    waiting.match = waiting.match or (
+                        _nearest_pose(around, stamp) if steps_back else _look_back(readings, stamp)
+                    )
             queue.append(_QueuedItem(number, item, (item.T_odom_base, None)))
         else:
             queue.append(_QueuedItem(number, item, _look_back(readings, item.stamp)))
@@ -139,19 +145,6 @@ def _with_pose(waiting: _QueuedItem, readings: deque[OdometryReading]) -> tuple[
     if scan.sweep is not None and fault is not Fault.NO_ODOMETRY:
         scan = scan._replace(sweep=moving_sweep(scan.sweep, scan.stamp, readings))
     return waiting.number, PosedScan(scan, T_odom_base, fault)
-
-
-def _assign_poses(queue: deque[_QueuedItem], previous: OdometryReading | None, newest: OdometryReading) -> None:
-    for waiting in queue:
-        stamp = waiting.item.stamp
-        if waiting.match is not None:
-            continue
-        if previous is not None and previous.stamp <= stamp <= newest.stamp:
-            waiting.match = _between(previous, newest, stamp)
-        elif previous is not None and newest.stamp < previous.stamp:
-            waiting.match = _nearest_pose([previous, newest], stamp)
-        elif stamp <= newest.stamp:
-            waiting.match = _nearest_pose([newest], stamp)
 
 
 def _insert(readings: deque[OdometryReading], late: OdometryReading) -> None:
