@@ -31,13 +31,6 @@ def test_what_lies_behind_the_image_is_nowhere_in_both_directions():
     assert not inside(warp(steep, behind), SIZE).any()
 
 
-def test_framing_covers_the_target_and_cuts_evenly():
-    framing = Framing.of((640, 448), (320, 240))
-    assert framing.scale == pytest.approx(240 / 448)
-    assert framing.crop_px == (int((640 * 240 / 448 - 320) / 2), 0)
-    assert Framing.of((320, 240), (320, 240)) == Framing(1.0, (0, 0))
-
-
 def test_the_framed_homography_is_the_homography_of_framed_points():
     first, second = Framing.of((640, 448), SIZE), Framing.of((500, 700), SIZE)
     framed = framed_homography(H, first, second, HomographyGroundTruth.CORRECTED)

@@ -11,8 +11,6 @@ from evaluation.vocabulary_growth import (
     grow_vocabulary,
 )
 
-from fcslam.places.index import PlaceIndex
-from fcslam.places.similarity import similarity
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from tests.benchmarks import place_folders
 
@@ -68,17 +66,3 @@ def test_each_strategy_is_asked_in_its_own_words(world, strategy):
     assert (growth.words > 1).all()
     assert (growth.seconds > 0.0).all()
     assert growth.intervals(-1, SEED)["mismatch rate"].mean < 0.5  # drawn places differ clearly
-
-
-def test_the_last_words_are_those_of_an_index_that_saw_the_same(world):
-    groups, arrivals = world
-    growth = grow_vocabulary(Strategy.INCREMENTAL, arrivals[:BATCH], groups, VocabularyConfig(), SEED)
-    config = VocabularyConfig(strategy=Strategy.INCREMENTAL, train_batch=BATCH - 2)
-    index = PlaceIndex(config, np.random.default_rng(SEED))
-    for place in arrivals[:BATCH]:
-        index.add(place.name, place.descriptors)
-    for g, group in enumerate(groups):
-        expected = [similarity(index.bag(group.target), index.bag(other)) for other in group.others]
-        np.testing.assert_allclose(growth.similarities[0, g], expected)
-        answers = {found.id: found.similarity for found in index.query(group.target, BATCH)}
-        np.testing.assert_allclose(growth.asked[g], [answers.get(name, 0.0) for name in group.names])

@@ -261,20 +261,6 @@ def test_a_keep_out_is_drawn_and_taken_back_and_the_map_is_downloaded(page, mapp
     assert parse_map("map", content["map.pgm"], content["map.yaml"].decode()).cells.size > 0
 
 
-def test_walls_in_a_box_are_erased_and_come_back(page, mapped):
-    page.goto(f"{mapped.url}#view=edits")
-    until(page, lambda: has_map(page), "the map")
-    page.wait_for_timeout(1000)
-    (walls,) = pixels(page, [WALL])
-    page.get_by_role("button", name="Erase a part").click()
-    drag(page, (0.1, 0.1), (0.9, 0.5))
-    page.get_by_role("button", name="Save").click()
-    until(page, lambda: pixels(page, [WALL])[0] < 0.8 * walls, "a map without these walls")
-    page.locator("#edits").get_by_role("button", name="Undo").first.click()
-    says(page, "#message", "Taken back")
-    until(page, lambda: pixels(page, [WALL])[0] > 0.95 * walls, "the walls")
-
-
 def test_a_robot_is_found_by_its_name_and_a_silent_one_is_named(page, mapped):
     robots = httpx.get(f"{mapped.url}{API}/robots").json()
     told = [{**robot, "last_heard_s": 150.0 if robot["robot"] == "robot_3" else 1.0} for robot in robots]
@@ -505,18 +491,6 @@ def test_a_connection_that_falls_silent_is_noticed(page, mapped):
     says(page, "#status", "No connection to the service; trying again")
     page.unroute("**/api/v1/events")
     says(page, "#status", "Live")
-
-
-def test_shortcuts_of_the_browser_are_left_to_it_and_the_pointer_has_coordinates(page, mapped):
-    page.goto(mapped.url)
-    until(page, lambda: has_map(page), "the map")
-    page.locator("#map").focus()
-    taken = """key => !document.getElementById("map").dispatchEvent(
-        new KeyboardEvent("keydown", { key, ctrlKey: true, cancelable: true }))"""
-    assert [page.evaluate(taken, key) for key in ("0", "-", "+")] == [False] * 3
-    page.locator("#map").hover()
-    assert re.fullmatch(r"x -?\d+\.\d\d m, y -?\d+\.\d\d m", page.locator("#pointer").inner_text())
-    assert re.fullmatch(r"[\d.]+ m", page.locator("#metres").inner_text())
 
 
 def fulfil(answer, route):

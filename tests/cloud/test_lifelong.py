@@ -106,13 +106,6 @@ def test_submaps_that_are_dropped_and_built_again_change_nothing(forgetful, pack
     assert fingerprint(cloud.finalize()) == fingerprint(forgetful.finalize())
 
 
-def test_poses_and_stamps_of_all_keyscans_stay(forgetful, sessions):
-    for robot in forgetful.finalize().robots:
-        assert len(robot.stamps) == len(robot.T_map_base) == len(robot.T_local_base)
-        assert np.all(np.diff(robot.stamps) > 0)
-        assert [robot.stamps[k.id.number] for k in robot.keyscans] == [k.stamp for k in robot.keyscans]
-
-
 def test_a_place_described_anew_after_its_keyscans_have_gone_changes_nothing(packets, sessions):
     cloud = feed(Cloud(ONE_A_SQUARE, 0), packets)
     before, last = cloud.fleet.estimate(), sessions[0][-1]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from fcslam.cloud.cloud import Cloud
-from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.replies import is_news
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
@@ -192,16 +191,6 @@ def test_detectors_of_two_channels_may_have_one_name():
         for sequence, body in enumerate(bodies):
             cloud.receive(encode(Packet(robot, 0, sequence, NOW, body)))
     assert len(cloud.finalize().robots) == 2
-
-
-def test_what_fails_does_not_count_as_received(scripted, monkeypatch):
-    """A fault of the cloud's own is no refusal: the packet is not acknowledged when it is sent again."""
-    cloud = feed(scripted(SCRIPT), PACKETS[:HALF])
-    monkeypatch.setattr(Fleet, "apply", lambda *_: 1 / 0)
-    data = encode(next_packet(keyscan("a", NUMBER, NOW)))
-    for _ in range(2):
-        with pytest.raises(ZeroDivisionError):
-            cloud.receive(data)
 
 
 def test_a_further_laser_may_be_announced_later(scripted):

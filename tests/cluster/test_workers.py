@@ -8,9 +8,8 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 
 from fcslam.cli import main
-from fcslam.cluster.verifying import check_workers, identify, verifying
+from fcslam.cluster.verifying import check_workers, verifying
 from fcslam.errors import InputError
-from fcslam.lidar.pair_verification import verify_here
 
 
 @pytest.mark.parametrize(
@@ -33,11 +32,6 @@ def test_a_choice_that_is_none_is_refused(where):
         check_workers(where)
 
 
-def test_by_default_this_process_verifies():
-    with verifying("1") as verify:
-        assert verify is verify_here
-
-
 def test_without_dask_a_cluster_is_refused_and_the_rest_works(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
@@ -55,13 +49,6 @@ def test_processes_here_do_not_load_dask():
         "    print(sorted({'dask', 'distributed'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout == "[]\n"
-
-
-def test_an_identity_is_the_same_each_time_and_holds_a_proof():
-    first = identify()
-    identify.cache_clear()
-    assert identify() == first
-    assert len(set(first)) == 3
 
 
 def test_the_authority_of_a_cluster_signs_no_robots_certificate(tmp_path):

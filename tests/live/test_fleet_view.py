@@ -6,7 +6,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from fcslam.errors import CloudError, UnavailableError
+from fcslam.errors import CloudError
 from fcslam.live.fleet_view import FleetView
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.keys import Credentials
@@ -111,16 +111,6 @@ def test_a_new_frame_shows_no_map_before_all_its_tiles_came(desk):
         with closing(view(desk, "a", limit_kBps=1e6)) as at_once:
             at_once.step()
             assert known(fleet.joint_map) == known(at_once.joint_map)
-
-
-def test_what_the_cloud_says_counts_with_its_tiles(desk, monkeypatch):
-    desk.send("a", A)
-    with closing(view(desk, "a")) as fleet:
-        monkeypatch.setattr(FleetClient, "tiles", lambda *_: (b"broken", ""))
-        with pytest.raises(UnavailableError, match="broken"):
-            fleet.step()
-        assert fleet.robots() == []
-        assert fleet.news == []
 
 
 def test_a_robot_that_is_taken_out_leaves_the_map_with_one_event(desk):

@@ -198,12 +198,6 @@ def test_viewers_get_the_files_of_the_live_run(shown):
         assert shown.ask("GET", f"{API}/{path}", "eye").status_code in (400, 404)
 
 
-def test_before_the_first_map_there_is_none(desk):
-    assert get(desk, "fleet").json()["robots"] == []
-    assert get(desk, "maps").json() == []
-    assert desk.ask("GET", f"{API}/maps/0.png", "eye").status_code == 404
-
-
 @pytest.mark.parametrize("path", ["maps/0/tiles/5/0/0.png", "maps/0/layers/changes", "closures"])
 def test_what_did_not_change_is_not_sent_again(shown, path):
     path = f"{API}/{path}"
