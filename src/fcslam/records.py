@@ -277,7 +277,7 @@ class Keyscan:
     id: KeyscanId
     stamp: float
     ranges_m: Ranges
-    """Shape (beam_count,), as in LaserScan, but an invalid range or a missing return is 0."""
+    """Shape (beam_count,), as in LaserScan: infinity for a missing return, 0 for an invalid range."""
     laser: int = 0
     """Index of its laser among those that the robot announced."""
     beams: Beams | None = None

@@ -2,6 +2,9 @@
 
 The place at time k is Z_k = {z_1 ... z_N}, z_i the tf-idf of word i (FC-SLAM, III.B). fcslam divides it by its L1 norm;
 without that, a threshold on the similarity would have no meaning.
+
+These functions compare two places, and are what the compiled score is tested against. The index compares a query with
+all stored places at once, by ``score_words`` or ``score_matches`` in ``fcslam.places.scoring``.
 """
 
 from dataclasses import dataclass

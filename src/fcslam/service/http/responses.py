@@ -222,7 +222,7 @@ class EditSummary(StrictModel):
     """An edit: what somebody changed about the mission by hand."""
 
     number: int = Field(description="number of the edit, from 1")
-    kind: str = Field(description="veto, removal, cut, pin, closure, placement, region or undo")
+    kind: str = Field(description="veto, removal, cut, pin, closure, placement, region, floor or undo")
     content: dict[str, Any] = Field(description="what it names")
     author: str
     time_s: float = Field(description="seconds since 1970")
