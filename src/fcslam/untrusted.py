@@ -24,6 +24,8 @@ from typing import Any, BinaryIO, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
+ZSTD: Final = b"\x28\xb5\x2f\xfd"
+"""The first bytes of a file or message in zstd."""
 MOST_BYTES: Final = 1 << 31
 """Largest file that is read as a whole."""
 MOST_TEXT_BYTES: Final = 1 << 18
@@ -108,7 +110,7 @@ def read_arrays(path: Path) -> Arrays:
 
 
 def open_unpacked(path: Path) -> BinaryIO:
-    """Open a file that may be compressed by gzip, xz or bzip2, as its first bytes say, to read what it holds."""
+    """Open a file that may be compressed by gzip, xz, bzip2 or zstd, as its first bytes say, to read what it holds."""
     file = open_file(path)
     magic = file.read(6)
     file.seek(0)
@@ -119,31 +121,32 @@ def open_unpacked(path: Path) -> BinaryIO:
         unpacking = lzma.LZMAFile(file)  # noqa: SIM115  _Limited closes it
     elif magic.startswith(b"BZh"):
         unpacking = bz2.BZ2File(file)
+    elif magic.startswith(ZSTD):
+        from backports import zstd
+
+        unpacking = zstd.open(file, "rb")
     else:
         return file
     return cast("BinaryIO", io.BufferedReader(_Limited(unpacking, file, size), _BUFFER_BYTES))
 
 
-def open_zstd(file: BinaryIO) -> BinaryIO:
-    """Read what an opened file holds that is compressed by zstd; reading has the limits of ``open_unpacked``."""
-    from backports import zstd
-
-    limited = _Limited(zstd.open(file, "rb"), file, os.fstat(file.fileno()).st_size, is_text=False)
-    return cast("BinaryIO", io.BufferedReader(limited, _BUFFER_BYTES))
-
-
 class _Limited(io.RawIOBase):
     """Bytes of an unpacking stream, up to the limits for a compressed file of ``size`` bytes."""
 
-    def __init__(self, stream: Any, file: BinaryIO, size: int, *, is_text: bool = True) -> None:
+    def __init__(self, stream: Any, file: BinaryIO, size: int) -> None:
         self._stream, self._file, self._size = stream, file, size
-        self._unpacked, self._lines_left = 0, MOST_LINES + size if is_text else 1 << 63
+        self._unpacked, self._lines_left = 0, MOST_LINES + size
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, buffer: Any) -> int:
-        content = self._stream.read(len(buffer))
+        try:
+            content = self._stream.read(len(buffer))
+        except OSError:
+            raise
+        except Exception as error:  # each library has errors of its own for a damaged or truncated archive
+            raise EOFError(str(error)) from error
         self._unpacked += len(content)
         self._lines_left -= content.count(b"\n")
         check_unpacked(self._size, self._unpacked, MOST_STREAM_RATIO)

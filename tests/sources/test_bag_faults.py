@@ -307,8 +307,10 @@ def test_a_file_that_is_not_the_bag_itself(tmp_path, name, change, words):
 def test_a_bag_that_is_compressed_as_a_whole_by_zstd(tmp_path):
     folder = save(tmp_path / "run", drive(20), "file")
     (packed,) = folder.glob("*.zstd")
-    assert "compressed by zstd; give its folder, or unpack it by `zstd -d" in refusal(packed)
-    assert len(scans_of(open_source(folder))) == 20
+    for path in (folder, packed):
+        assert len(scans_of(open_source(path))) == 20
+    packed.write_bytes(packed.read_bytes()[:-100])
+    assert "truncated or damaged" in refusal(packed)
 
 
 def test_a_folder_whose_file_was_not_fetched(tmp_path):

@@ -6,8 +6,6 @@ coordinate frame and no alignment.
 """
 
 import io
-import lzma
-import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -179,7 +177,7 @@ def read_relations(path: Path) -> Relations:
     try:
         with open_unpacked(path) as file, io.TextIOWrapper(file, encoding="utf-8") as lines:
             rows = _parse(lines, path)
-    except (OSError, EOFError, UnicodeDecodeError, zlib.error, lzma.LZMAError) as error:
+    except (OSError, EOFError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot read the relations ({error})") from error
     if not rows:
         raise InputError(f"{path}: no relations in it; expected lines '{_COLUMNS}'")

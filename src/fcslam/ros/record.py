@@ -11,7 +11,7 @@ from typing import Any
 
 from fcslam.errors import InputError
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC
-from fcslam.ros.inbox import POLL_S, Inbox, ReceivedMessage
+from fcslam.ros.inbox import POLL_S, Inbox
 from fcslam.ros.live_plan import Notify
 from fcslam.ros.network import RosNetwork
 from fcslam.ros.topics import SensorTopics
@@ -30,30 +30,40 @@ def record(
     The file moves to ``output`` at the end. If it cannot be written to the end, what the disk took is kept beside it,
     but for the last megabyte.
     """
+    from rosbags import rosbag2
+
     inbox = Inbox()
     kinds = {**topics.kinds, CLOCK_TOPIC: CLOCK}
     inbox.subscribe(network, kinds, {}, time.time_ns)
     counts: Counter[str] = Counter()
-    kept = ""
+    connections: dict[str, Any] = {}
+    latest_ns, kept = 0, ""
     try:
         with TemporaryDirectory(prefix=".", dir=output.parent) as staging:
-            recording = _Recording(Path(staging, output.stem))
+            place = Path(staging, output.stem)
+            writer = rosbag2.Writer(place, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+            file = place / f"{place.name}.mcap"
             try:
-                recording.writer.open()
+                writer.open()
                 while (message := inbox.get(POLL_S)) is not None or not stop.is_set():
                     if message is not None:
-                        recording.write(message, kinds[message.topic])
-                        counts[message.topic] += 1
-                recording.writer.close()
+                        topic = message.topic
+                        if topic not in connections:
+                            name = full_name(kinds[topic])
+                            connections[topic] = writer.add_connection(topic, name, typestore=typestore(ros1=False))
+                        latest_ns = max(latest_ns, message.received_ns)  # the time of recording only ever grows
+                        writer.write(connections[topic], latest_ns, message.payload)
+                        counts[topic] += 1
+                writer.close()
             except BaseException as error:
                 with suppress(Exception):
-                    recording.writer.abort()
-                if counts and recording.file.exists():  # a bag that was cut off is read up to there
-                    kept = f"what was recorded before is in {recording.file.replace(_part_of(output))}"
+                    writer.abort()
+                if counts and file.exists():  # a bag that was cut off is read up to there
+                    kept = f"what was recorded before is in {file.replace(_part_of(output))}"
                     if not isinstance(error, OSError):
                         notify(kept)
                 raise
-            recording.file.replace(output)
+            file.replace(output)
     except OSError as error:
         advice = "; ".join(filter(None, (kept, "free some space, or choose another path")))
         raise InputError(f"{output}: cannot be written ({error}); {advice}") from error
@@ -70,22 +80,3 @@ def _part_of(output: Path) -> Path:
     parts = (f"part-{number}" if number > 1 else "part" for number in count(1))
     places = (output.with_name(f"{output.stem}.{part}{output.suffix}") for part in parts)
     return next(place for place in places if not place.exists())
-
-
-class _Recording:
-    def __init__(self, place: Path) -> None:
-        from rosbags import rosbag2
-
-        self._store = typestore(ros1=False)
-        self._connections: dict[str, Any] = {}
-        self._latest_ns = 0
-        self.writer = rosbag2.Writer(place, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
-        self.file = place / f"{place.name}.mcap"
-
-    def write(self, message: ReceivedMessage, kind: str) -> None:
-        """Write a message; the time of recording only ever grows."""
-        topic, payload, received_ns = message
-        if topic not in self._connections:
-            self._connections[topic] = self.writer.add_connection(topic, full_name(kind), typestore=self._store)
-        self._latest_ns = max(self._latest_ns, received_ns)
-        self.writer.write(self._connections[topic], self._latest_ns, payload)

@@ -10,7 +10,7 @@ import numpy as np
 
 from fcslam.errors import SourceError
 from fcslam.records import LaserScan
-from fcslam.sources.bags.container import ZSTD, is_bag, parts_of
+from fcslam.sources.bags.container import is_bag, parts_of
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_errors
@@ -134,8 +134,6 @@ def format_of(path: Path) -> str:
         raise SourceError(f"{path}: is a folder, not a recording; give the file of a recording ({known})")
     if path.name == "metadata.yaml":
         raise SourceError(f"{path}: describes a bag; give its folder, {path.parent}")
-    if content.startswith(ZSTD):
-        raise SourceError(f"{path}: is compressed by zstd; give its folder, or unpack it by `zstd -d {path.name}`")
     raise SourceError(f"{path}: not a recording of a known format (it starts with {content[:16]!r}); give a {known}")
 
 

@@ -34,7 +34,7 @@ from fcslam.sources.bags.codec import (
     TRANSFORMS,
     MessageCodec,
 )
-from fcslam.sources.bags.container import ZSTD, BagPart, Topic, check_order, open_parts
+from fcslam.sources.bags.container import BagPart, Topic, check_order, open_parts
 from fcslam.sources.bags.messages import (
     LONGEST_NAME,
     BeamsError,
@@ -48,7 +48,7 @@ from fcslam.sources.bags.messages import (
 )
 from fcslam.sources.bags.records import MessagePlace, StoredMessage
 from fcslam.sources.bags.transforms import Link, TransformTree, differ
-from fcslam.untrusted import unpack
+from fcslam.untrusted import ZSTD, unpack
 
 _LATEST_NS: Final = int(np.iinfo(np.int64).max)
 """Of a damaged file, some times are larger."""

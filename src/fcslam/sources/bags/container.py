@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 from weakref import finalize
 
 from fcslam.config import one_line
@@ -15,7 +15,7 @@ from fcslam.errors import SourceError
 from fcslam.sources.bags.codec import NANOSECONDS, OLD_TRANSFORMS, TRANSFORMS
 from fcslam.sources.bags.records import MCAP_MAGIC, ROS1_MAGIC, SQLITE_MAGIC, DatabaseFile, RecordFile
 from fcslam.sources.logs.archive import translate_errors
-from fcslam.untrusted import open_file, open_zstd
+from fcslam.untrusted import ZSTD, open_file, open_unpacked
 
 _METADATA, _ZSTD_SUFFIX = "metadata.yaml", ".zstd"
 _SUFFIXES = (".mcap", ".db3", ".bag", ".active")
@@ -24,8 +24,6 @@ _REMEDIES = {
     MCAP_MAGIC: "copy it again, or mend it with `mcap recover`",
     SQLITE_MAGIC: "copy it again, or mend it with `ros2 bag reindex`",
 }
-ZSTD = b"\x28\xb5\x2f\xfd"
-"""The first bytes of a file or message in zstd."""
 _LONGEST_PAUSE_NS, _LONGEST_OVERLAP_NS = 60 * NANOSECONDS, NANOSECONDS
 """Of the scans in two parts of one recording, from the end of one to the beginning of the next."""
 
@@ -82,10 +80,8 @@ class BagPart:
                 open_file(path, path.parent).close()
             with open_file(path) as file:
                 head = file.read(len(SQLITE_MAGIC))
-                if path.suffix == _ZSTD_SUFFIX and head.startswith(ZSTD):
-                    file.seek(0)
-                    path = self._unpack(path, open_zstd(file))
-            if path != self.path:
+            if path.suffix == _ZSTD_SUFFIX and head.startswith(ZSTD):
+                path = self._unpack(path)
                 with open_file(path) as file:
                     head = file.read(len(SQLITE_MAGIC))
         self._remedy = next((_REMEDIES[magic] for magic in _REMEDIES if head.startswith(magic)), "")
@@ -97,11 +93,11 @@ class BagPart:
             DatabaseFile(path) if head == SQLITE_MAGIC else RecordFile(path, head.startswith(ROS1_MAGIC))
         )
 
-    def _unpack(self, path: Path, content: BinaryIO) -> Path:
+    def _unpack(self, path: Path) -> Path:
         folder = mkdtemp(prefix="fcslam-")
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         unpacked = Path(folder, path.stem)
-        with unpacked.open("wb") as file:
+        with open_unpacked(path) as content, unpacked.open("wb") as file:
             shutil.copyfileobj(content, file)
         return unpacked
 

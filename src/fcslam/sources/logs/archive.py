@@ -1,9 +1,7 @@
 """Reads log files, compressed or not, as lines of bytes."""
 
 import gzip
-import lzma
 import re
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -62,7 +60,7 @@ def translate_errors(path: Path) -> Iterator[None]:
         raise SourceError(f"{path}: no such file; check the path of the recording") from error
     except IsADirectoryError as error:
         raise SourceError(f"{path}: is a folder; give the recording's file in it") from error
-    except (EOFError, lzma.LZMAError, zlib.error, gzip.BadGzipFile) as error:
+    except (EOFError, gzip.BadGzipFile) as error:
         raise SourceError(f"{path}: the archive is truncated or damaged ({error}); copy it again") from error
     except (OSError, ValueError) as error:
         raise SourceError(f"{path}: cannot be read ({error}); check the file and its permissions") from error
