@@ -15,8 +15,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.odometry import OdometryModel
 from fcslam.lidar.tracker import ScanTracker
 from fcslam.records import LaserScan, Sweep, frozen
-from fcslam.sources.contradictions import STILL_RAD
-from fcslam.sources.motion import STILL_M
+from fcslam.sources.motion import STILL_M, STILL_RAD
 
 LONGEST_GAP_S: Final = 1.0
 """A scan after a longer gap says nothing about the motion during the one before it, nor the reverse."""

@@ -14,8 +14,7 @@ from fcslam.lidar.matching import FIXED, WIDE_SCALE_M, ScanMatch, match_scan
 from fcslam.lidar.odometry import OdometryError, OdometryModel, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import FloatArray, LaserScan, Sweep
-from fcslam.sources.contradictions import STILL_RAD
-from fcslam.sources.motion import STILL_M
+from fcslam.sources.motion import STILL_M, STILL_RAD
 
 GOOD_SIGMA = 0.3
 """The points of a good match, by which odometry is judged, fix the position in every direction to this share of

@@ -13,12 +13,10 @@ import numpy as np
 
 from fcslam.records import LaserScan, Ranges
 from fcslam.sources.faults import FEWEST, Audit, Fault
-from fcslam.sources.motion import STILL_M
+from fcslam.sources.motion import STILL_M, STILL_RAD
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import Pose
 
-STILL_RAD = 0.003
-"""Odometry that turned by less stands still."""
 CHANGE_M, CHANGE = 0.3, 0.05
 """A range that differs by more, in metres and as a share of it, measures something else."""
 CHANGED = 0.6

@@ -24,8 +24,10 @@ FEWEST_STEPS: Final = 4
 """Steps of a moving robot that show it."""
 LONGEST_UPDATE_S: Final = 0.35
 """A robot whose odometry does not change for longer stands still."""
-STILL_M, LEAST_STEP_RAD = 0.005, 0.005
-"""A smaller change is that of a robot at rest, or of an encoder at a low speed."""
+STILL_M, STILL_RAD = 0.005, 0.003
+"""Odometry that moved less stands still."""
+LEAST_STEP_RAD = 0.005
+"""A smaller turn between two readings is that of an encoder at a low speed."""
 
 
 class Reading(Protocol):
