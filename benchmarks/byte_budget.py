@@ -2,7 +2,7 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/byte_budget.py
 
-The logs cut into robots as elsewhere (README). Each robot's packets go through `fcslam.robot.budget`, as by `fcslam
+The logs cut into robots as elsewhere (README). Each robot's packets go through `fcslam.robot.uplink`, as by `fcslam
 robot --budget-kBps`, with shares of what the log's robots send on average when there is no budget: hello, keyscans and
 constraints always travel, places are thinned to their strongest descriptors or left out. So a budget below what the
 chain takes is not kept; what was sent is stated. Errors are over the relations between different robots, of which those
@@ -26,8 +26,8 @@ from fcslam.errors import InputError
 from fcslam.lab.evaluation.relations import evaluate_relations
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import ClosureStatus, Place
-from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import RobotFrontend
+from fcslam.robot.uplink import Budget
 from fcslam.sources import open_source, split
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode

@@ -45,7 +45,7 @@ def test_the_programs_of_the_page_run(my_robot, tmp_path, monkeypatch, capsys):
         my_robot.server = cloud.url
         for scan in my_robot.scans():
             my_robot.robot.add_scan(*scan)
-        assert len(programs()) == 7
+        assert len(programs()) == 6
         for number, program in enumerate(programs()):
             if number == 1:  # the first one has shown that a program gets a process beside it
                 monkeypatch.setattr("fcslam.live.records.worker_process", SameThread)

@@ -10,7 +10,7 @@ from fcslam.errors import CloudError, InputError
 from fcslam.features.detector_file import describe_detector_file
 from fcslam.geometry import se2
 from fcslam.live.playback import PlaybackPace, play
-from fcslam.live.records import EventKind, LocalizationState, Playback, Wiring
+from fcslam.live.records import EventKind, LocalizationState, Wiring
 from fcslam.live.robot import Robot
 from fcslam.maps.occupancy_map import Occupancy
 from fcslam.records import Channel, Place
@@ -66,7 +66,7 @@ def drive(tmp_path, network, records, resume=False, watch=lambda _: None, record
     robot = Robot(
         "alice", state=tmp_path, own_map=False,
         wiring=Wiring(
-            SameThread(), Clock(), lambda _: pause.wait(0.001), Playback(recording, resume), transport=network
+            SameThread(), Clock(), lambda _: pause.wait(0.001), recording, resume, transport=network
         ),
     )  # fmt: skip
     with closing(robot):
@@ -220,7 +220,8 @@ def test_a_full_disk_does_not_fill_the_memory(scans, tmp_path, monkeypatch):
         raise InputError("disk full")
 
     monkeypatch.setattr(Outbox, "put", put)
-    with Robot("alice", scans[0].laser, state=tmp_path, wiring=Wiring(SameThread())) as robot:
+    wiring = Wiring(SameThread(), transport=Network(FakeCloud()))
+    with Robot("alice", scans[0].laser, state=tmp_path, wiring=wiring) as robot:
         for scan in scans:
             robot.add_scan(scan.ranges_m, scan.stamp, scan.T_odom_base)
         with pytest.raises(InputError, match="disk full"):

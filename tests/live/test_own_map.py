@@ -25,7 +25,7 @@ class Instant:
 
 def test_packets_that_were_applied_are_forgotten():
     corrected, worker = [], Instant()
-    own = OwnMap("anna", None, worker, lambda part, _: corrected.append(part), 0)
+    own = OwnMap("anna", None, worker, lambda part, _: corrected.append(part))
     packets = [said(ordinal, HELLO, float(ordinal)) for ordinal in range(50)]
     for packet in packets:
         own.put([packet])

@@ -18,7 +18,7 @@ from tests import small_fleet
 from tests.carmen_logs import write_carmen
 from tests.lidar import worlds
 from tests.live.same_thread import SameThread
-from tests.robot.kidnapping import drives, kidnapping
+from tests.robot.kidnapping import kidnapping
 
 pytestmark = pytest.mark.slow
 
@@ -135,26 +135,6 @@ def test_a_lost_robot_says_so_and_finds_its_place_again():
     assert (lost.kind, found.kind) == (fcslam.EventKind.LOST, fcslam.EventKind.RELOCALIZED)
     assert moment < lost.stamp < found.stamp
     assert all(pose.is_localized == (not lost.stamp <= pose.stamp < found.stamp) for pose in poses if settled(pose))
-
-
-def test_a_robot_that_starts_again_finds_its_earlier_map(tmp_path):
-    first, again = drives()
-    with fcslam.Robot("anna", first[0].laser, state=tmp_path, wiring=Wiring(SameThread())) as robot:
-        drive(robot, first[:80])
-    events = []
-    with fcslam.Robot(
-        "anna", first[0].laser, state=tmp_path, wiring=Wiring(SameThread()), on_event=events.append
-    ) as robot:
-        poses = drive(robot, again)
-        robot.finish()
-        run = robot.save(tmp_path / "run")
-    assert poses[0].map_index is None
-    assert next(pose.map_index for pose in poses if pose.map_index is not None) == 1, "a map of its own at first"
-    assert poses[-1].map_index == 0
-    assert fcslam.EventKind.JOINED in {event.kind for event in events}
-    assert list(run.trajectories) == ["anna", "anna+1"]
-    assert len(run.maps) == 1
-    assert run.trajectories["anna+1"].map_index == 0
 
 
 def test_a_worker_that_ends_is_told_once_and_the_robot_goes_on(scans, caplog):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fcslam.records import Place, frozen
-from fcslam.robot.budget import BURST_S, FEWEST_DESCRIPTORS, Budget
+from fcslam.robot.uplink import BURST_S, FEWEST_DESCRIPTORS, Budget
 from fcslam.wire.packets import encode
 from tests.robot.fake_cloud import said
 from tests.wire.examples import CLOSURE, HELLO, KEYSCAN, LIDAR_PLACE

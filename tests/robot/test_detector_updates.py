@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from fcslam.errors import FeatureError, InputError
-from fcslam.robot.detector_updates import DetectorUpdates
 from fcslam.robot.outbox import Outbox
+from fcslam.robot.uplink import DetectorUpdates
 from tests.wire.examples import DETECTOR_UPDATE
 
 FIRST, SECOND = DETECTOR_UPDATE.file, replace(DETECTOR_UPDATE.file, version="second")

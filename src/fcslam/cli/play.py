@@ -69,7 +69,7 @@ def play(
     from fcslam.cloud.sessions import check_robot
     from fcslam.live.playback import PlaybackPace
     from fcslam.live.playback import play as play_records
-    from fcslam.live.records import Playback, Wiring
+    from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
@@ -90,7 +90,7 @@ def play(
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
     fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kBps, floor)
     with copied_process(settings.robot) as worker:
-        wiring = Wiring(worker, playback=Playback(fingerprint, resume), keeps_keyframes=learn)
+        wiring = Wiring(worker, recording=fingerprint, resumes=resume, keeps_keyframes=learn)
         robot = Robot(
             opened.name, server=cloud, state=state, config=settings, own_map=False, floor=floor, wiring=wiring
         )

@@ -7,7 +7,6 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -20,8 +19,8 @@ from fcslam.mission.mission import MissionCloud, MissionConfig
 from fcslam.records import Correction, FloatArray
 from fcslam.robot.backend_runner import WorkerObject
 from fcslam.runs import Run
-from fcslam.wire.messages import Hello, Packet
-from fcslam.wire.packets import SizedPacket, decode, measure
+from fcslam.wire.messages import Packet
+from fcslam.wire.packets import measure
 
 Answer = TypeVar("Answer")
 Correct = Callable[[int, Correction], None]
@@ -31,11 +30,9 @@ Correct = Callable[[int, Correction], None]
 class OwnMap:
     """Gets all packets of one robot, in their order, and corrects its poses. Any thread may call."""
 
-    def __init__(
-        self, robot: str, config: MissionConfig, executor: Executor, correct: Correct, first_epoch: int
-    ) -> None:
-        """Start a map in the only worker of ``executor``; session 0 of this start is that of ``first_epoch``."""
-        self._robot, self._correct, self._first_epoch = robot, correct, first_epoch
+    def __init__(self, robot: str, config: MissionConfig, executor: Executor, correct: Correct) -> None:
+        """Start a map in the only worker of ``executor``."""
+        self._robot, self._correct = robot, correct
         self.failure: str | None = None
         """Why the map stopped growing; None if it grows."""
         self._applying: deque[Future[list[tuple[int, Correction]]]] = deque()
@@ -43,11 +40,6 @@ class OwnMap:
         """Packets that the worker does not have yet: to hand over each for itself would cost scans time."""
         self._lock = threading.Lock()
         self._cloud = WorkerObject(executor, f"map of {robot}", MissionCloud, config)
-
-    def restore(self, packets: Sequence[bytes]) -> None:
-        """Apply the packets of earlier sessions, encoded, before those of this one; later."""
-        if packets:
-            self._await(self._cloud.call(_restore, packets))
 
     def put(self, packets: Sequence[Packet]) -> None:
         """Keep the next packets for ``hand_over``; each answer is of all packets so far."""
@@ -60,7 +52,10 @@ class OwnMap:
         with self._lock:
             if self._kept and self._kept[0].time < before_s:
                 packets, self._kept = self._kept, []
-                self._await(self._cloud.call(_apply, packets, self._first_epoch))
+                applied = self._cloud.call(_apply, packets)
+                self._forget_applied()
+                self._applying.append(applied)
+                applied.add_done_callback(self._take)
 
     @property
     def backlog(self) -> int:
@@ -90,11 +85,6 @@ class OwnMap:
         while self._applying and self._applying[0].done():
             self._applying.popleft()
 
-    def _await(self, applied: Future[list[tuple[int, Correction]]]) -> None:
-        self._forget_applied()
-        self._applying.append(applied)
-        applied.add_done_callback(self._take)
-
     def _take(self, done: Future[list[tuple[int, Correction]]]) -> None:
         if done.cancelled():
             return
@@ -119,19 +109,7 @@ def _call_host(cloud: MissionCloud, function: Callable[..., Answer], *arguments:
     return function(cloud.host, *arguments)
 
 
-def _restore(cloud: MissionCloud, earlier: Sequence[bytes]) -> list[tuple[int, Correction]]:
-    for data in earlier:
-        cloud.apply(SizedPacket(decode(data), data))
-    return []
-
-
-def _apply(cloud: MissionCloud, packets: Sequence[Packet], first_epoch: int) -> list[tuple[int, Correction]]:
-    """Apply packets, whose epochs count from this start; returns the corrections with their sessions."""
-    numbered = (_in_epoch(packet, first_epoch + packet.epoch) for packet in packets)
-    replies = [reply for packet in numbered for reply in cloud.apply(measure(packet))]
-    return [(reply.epoch - first_epoch, reply.body) for reply in replies if isinstance(reply.body, Correction)]
-
-
-def _in_epoch(packet: Packet, epoch: int) -> Packet:
-    body = replace(packet.body, epoch=epoch) if isinstance(packet.body, Hello) else packet.body
-    return replace(packet, epoch=epoch, body=body)
+def _apply(cloud: MissionCloud, packets: Sequence[Packet]) -> list[tuple[int, Correction]]:
+    """Apply packets; returns the corrections with their sessions."""
+    replies = [reply for packet in packets for reply in cloud.apply(measure(packet))]
+    return [(reply.epoch, reply.body) for reply in replies if isinstance(reply.body, Correction)]

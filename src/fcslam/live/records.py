@@ -16,7 +16,7 @@ from fcslam.lidar.odometry import OdometryModel
 from fcslam.lidar.tracker import SEARCH_SIGMA_M, TrackedScan, weakest_sigma_m
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.backend_runner import worker_process
-from fcslam.robot.uplink import UplinkStatus
+from fcslam.robot.outbox import WaitingPackets
 from fcslam.wire.http_transport import HttpTransport
 
 
@@ -109,9 +109,23 @@ class LocalizationState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class RobotStatus(UplinkStatus):
+class RobotStatus:
     """State of a robot: its place in the map, its connection, and counts since its start."""
 
+    waiting: WaitingPackets = WaitingPackets(0, 0)  # noqa: RUF009
+    """Packets that the server has not confirmed."""
+    confirmed: int = 0
+    """Packets that the server has confirmed."""
+    sent_bytes: int = 0
+    """Bytes of the packets that were sent, each time that they were."""
+    left_out: int = 0
+    """Places that are not sent, because the state folder or the budget has no room for them."""
+    refused: int = 0
+    """Packets that the server will never store."""
+    trouble: str | None = None
+    """Why packets do not arrive; None if they do, or if there is no server."""
+    is_catching_up: bool = False
+    """Whether a resumed recording has not yet reached the point of interruption."""
     scans: int = 0
     keyscans: int = 0
     map_index: int | None = None
@@ -178,15 +192,6 @@ class RobotEvent:
     """One line for people."""
 
 
-class Playback(NamedTuple):
-    """A recording that is played to a robot."""
-
-    fingerprint: str
-    """Fingerprint of the recording and the settings."""
-    resume: bool
-    """Whether the robot read it before and was interrupted; its packets come again."""
-
-
 class Wiring(NamedTuple):
     """What a live robot takes from the computer, and what fcslam's own commands ask of it."""
 
@@ -196,8 +201,10 @@ class Wiring(NamedTuple):
     """Seconds of any origin, for the age of corrections and for retries."""
     sleep: Callable[[float], None] = time.sleep
     """Sleeps for a number of seconds while ``finish`` waits for the server."""
-    playback: Playback = Playback("live", resume=False)
-    """The recording that is played."""
+    recording: str = "live"
+    """Fingerprint of the recording that is played, and of the settings."""
+    resumes: bool = False
+    """Whether the robot read the recording before and was interrupted; its packets come again."""
     keeps_keyframes: bool = False
     """Whether the keyframes of the camera stay in the state folder, for a process that learns from them; the next start
     removes them."""

@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, wait
 from contextlib import ExitStack, closing
-from dataclasses import fields
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,7 +26,7 @@ from fcslam.live.inputs import Lasers, checked_camera, checked_image, checked_st
 from fcslam.live.joint_map import JointMap
 from fcslam.live.map_poses import MapPoses
 from fcslam.live.own_map import OwnMap
-from fcslam.live.records import WIRED, EventKind, Playback, RobotEvent, RobotPose, RobotStatus, Wiring
+from fcslam.live.records import WIRED, EventKind, RobotEvent, RobotPose, RobotStatus, Wiring
 from fcslam.live.tracker import LiveTracker
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.driving import track_of
@@ -43,12 +43,11 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.robot.backend_runner import in_worker
-from fcslam.robot.budget import Budget
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.keyframe_folder import KEYFRAMES
 from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import CONNECTING
-from fcslam.robot.uplink import Uplink, UplinkStatus
+from fcslam.robot.uplink import Uplink
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.warmup import warm_up_tracking
 from fcslam.wire.checks import check_floor
@@ -112,8 +111,7 @@ class Robot(LiveTracker):
             camera: its camera, if it has one.
             server: the `fcslam serve` of the robot's fleet: its address, or a ``Server`` with token, certificates and
                 limit. None: the robot maps alone.
-            state: folder of this robot alone; a robot that starts again with it finds its place in its earlier map.
-                With a server it holds the packets that the server has not confirmed. None: nothing is kept.
+            state: folder of this robot alone, for the packets that its server has not confirmed. None: nothing is kept.
             config: as in ``map_recordings``.
             own_map: whether the robot has a map of its own; a robot with a server may do without.
             floor: floor of the building, 1 to 16 letters, digits and ``. _ + -``. Places of different floors are never
@@ -134,7 +132,7 @@ class Robot(LiveTracker):
         self._applied: Correction | None = None
         """The correction that the newest pose was made with."""
         self._map_poses = MapPoses(wiring.clock)
-        self._keyscans = self._first_session = 0
+        self._keyscans = 0
         self._is_placed = False
         """Whether the poses of all keyframes are written."""
         self._is_online: bool | None = None
@@ -148,38 +146,14 @@ class Robot(LiveTracker):
         """Changes of the fleet that were told."""
         with ExitStack() as stack:
             executor = self._executor = wiring.started(stack)
-            outbox, transport = None, wiring.transport
             access = Server(server) if isinstance(server, str) else server
-            folder = _state_folder(state, access is not None or transport is not None, stack)
-            budget_kBps = None if access is None else access.budget_kBps
-            if folder is not None:
-                outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", name, LARGEST_OUTBOX_BYTES)))
-            if access is not None and outbox is not None:
-                shown = Credentials(access.token, access.ca, access.certificate)
-                transport = stack.enter_context(closing(HttpTransport(access.url, name, outbox.agent, shown)))
-                if own_map:
-                    self.fleet = FleetView(FleetClient(access.url, shown), name, self._place, budget_kBps)
-                    stack.enter_context(closing(self.fleet)).start()
-                    self._joint = JointMap(self.fleet, self._config.map)
-            known = 0 if outbox is None else outbox.begin(*wiring.playback)
-            keyframes = _keyframe_folder(folder, wiring.playback) if wiring.keeps_keyframes else None
-            self._start(executor, outbox if transport is None else None, own_map, keyframes)
+            sends = access is not None or wiring.transport is not None
+            folder = _state_folder(state, sends, stack)
+            keyframes = _keyframe_folder(folder, wiring.resumes) if wiring.keeps_keyframes else None
+            self._start(executor, own_map, keyframes)
             self._frontend.change_floor(floor)
-            self._outbox = outbox
-            if outbox is not None and folder is not None:
-                # Not the seed of the configuration: robots must not retry at the same moments.
-                self._uplink = Uplink(
-                    self._frontend,
-                    outbox,
-                    transport,
-                    folder,
-                    np.random.default_rng(),
-                    self._clock,
-                    self._map_poses.correct_by_server,
-                    known,
-                    None if budget_kBps is None else Budget(1e3 * budget_kBps),
-                )
-                stack.callback(self._uplink.close)
+            if sends and folder is not None:
+                self._uplink = self._connect(access, folder, wiring, own_map, stack)
             warm_up_tracking(self._config.robot)
             self._stack = stack.pop_all()
 
@@ -214,17 +188,27 @@ class Robot(LiveTracker):
         failure = self._frontend.packets.failure
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
-        notices = tuple(filter(None, (*(uplink.notices if uplink else ()), broken, jumps)))
-        sent = UplinkStatus() if uplink is None else uplink.status()
-        return RobotStatus(
-            **{field.name: getattr(sent, field.name) for field in fields(sent)},
+        status = RobotStatus(
             scans=self._scans,
             keyscans=self._keyscans,
             map_index=localizer.map_index,
             correction_age_s=localizer.age_s,
             quality=localizer.quality,
             times_lost=self._session - max(session for session, track in enumerate(tracks) if track.is_new_floor),
-            notices=notices,
+            notices=tuple(filter(None, (*(uplink.notices if uplink else ()), broken, jumps))),
+        )
+        if uplink is None:
+            return status
+        sender = uplink.sender
+        return replace(
+            status,
+            waiting=uplink.outbox.waiting,
+            confirmed=sender.confirmed,
+            sent_bytes=sender.sent_bytes,
+            left_out=uplink.left_out,
+            refused=sender.refusals,
+            trouble=sender.trouble,
+            is_catching_up=uplink.is_catching_up,
         )
 
     def map(self) -> OccupancyMap:
@@ -256,14 +240,14 @@ class Robot(LiveTracker):
         self._catch_up()
         with self._lock:
             session = self._session
-        return own.draw(self._session_name(session), self._map_poses.T_map_own(session))
+        return own.draw(session_name(self.name, session), self._map_poses.T_map_own(session))
 
     def closures(self) -> FloatArray:
         """Both ends of each loop closure that holds in the robot's map, shape (N, 2, 2), metres in ``map``."""
         own = self._require_own_map()
         with self._lock:
             session = self._session
-        return own.closures(self._session_name(session), self._map_poses.T_map_own(session))
+        return own.closures(session_name(self.name, session), self._map_poses.T_map_own(session))
 
     def trajectory(self) -> RobotTrajectory:
         """All scans since the robot was last lost or changed its floor; it waits for the worker.
@@ -277,7 +261,7 @@ class Robot(LiveTracker):
             track = self._frontend.tracks[session]
             stamps, keyscans, offsets = track.stamps, track.keyscans, track.T_keyscan_base
             T_odom_keyscan = track.T_odom_keyscan
-        known = np.empty((0, 3)) if self._own is None else self._own.poses(self._session_name(session))
+        known = np.empty((0, 3)) if self._own is None else self._own.poses(session_name(self.name, session))
         # The map may have got keyscans since the track was read.
         known = se2.compose(self._map_poses.T_map_own(session), known[: len(T_odom_keyscan)])
         # Keyscans that the map does not have yet go on from the last one that it has.
@@ -289,7 +273,11 @@ class Robot(LiveTracker):
         index = self._map_poses.localizer(session).map_index
         T_map_base = se2.compose(poses[keyscans], offsets)
         return RobotTrajectory(
-            self._session_name(session), 0 if index is None else index, frozen(stamps), frozen(T_map_base), track.floor
+            session_name(self.name, session),
+            0 if index is None else index,
+            frozen(stamps),
+            frozen(T_map_base),
+            track.floor,
         )
 
     def finish(self, timeout_s: float | None = None, watch: Callable[[RobotStatus], None] | None = None) -> bool:
@@ -318,10 +306,10 @@ class Robot(LiveTracker):
         uplink = self._uplink
         if uplink is None:
             return True
-        while (uplink.unstored or uplink.waiting.packets) and self._clock() < until_s:
+        while (uplink.unstored or uplink.outbox.waiting.packets) and self._clock() < until_s:
             self._wait_once(watch)
         self._raise_failure()
-        return not uplink.unstored and not uplink.waiting.packets
+        return not uplink.unstored and not uplink.outbox.waiting.packets
 
     def idle(self) -> None:
         """Write where the keyframes are, for a process that learns from them, and take a detector that the server
@@ -360,7 +348,7 @@ class Robot(LiveTracker):
         with self._lock:
             self._take(self._frontend.ready(wait=True))  # a run needs the keyscans of all its scans
             sessions = enumerate(self._frontend.tracks)
-            tracks = {self._session_name(session): track_of(track) for session, track in sessions if len(track)}
+            tracks = {session_name(self.name, session): track_of(track) for session, track in sessions if len(track)}
         if not tracks:
             raise InputError(f"{self.name}: no scan was added, so there is no map to save")
         stamps = np.concatenate([track.stamps for track in tracks.values()])
@@ -368,14 +356,10 @@ class Robot(LiveTracker):
         run.save(folder, force)
         return run
 
-    def _session_name(self, session: int) -> str:
-        return session_name(self.name, self._first_session + session)
-
-    def _start(self, executor: Executor, outbox: Outbox | None, own_map: bool, keyframes: Path | None) -> None:
+    def _start(self, executor: Executor, own_map: bool, keyframes: Path | None) -> None:
         robot = self._config.robot
-        self._first_session = first = 0 if outbox is None else outbox.first_epoch
         try:
-            self._own = OwnMap(self.name, self._config, executor, self._correct, first) if own_map else None
+            self._own = OwnMap(self.name, self._config, executor, self._correct) if own_map else None
             backend = in_worker(self.name, robot, executor, keyframes)
             self._frontend = RobotFrontend(self.name, robot, backend, self._mark_teammates)
         except BrokenExecutor as error:
@@ -383,8 +367,34 @@ class Robot(LiveTracker):
                 f"{self.name}: the process of the back end does not start; a script that makes a Robot needs "
                 '`if __name__ == "__main__":` around its own code'
             ) from error
-        if self._own is not None and outbox is not None:
-            self._own.restore(outbox.complete_sessions())
+
+    def _connect(
+        self, access: Server | None, folder: Path, wiring: Wiring, follows_fleet: bool, stack: ExitStack
+    ) -> Uplink:
+        """Begin to send and to follow the fleet, until ``stack`` is closed."""
+        outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", self.name, LARGEST_OUTBOX_BYTES)))
+        transport, budget_kBps = wiring.transport, None
+        if access is not None:
+            shown, budget_kBps = Credentials(access.token, access.ca, access.certificate), access.budget_kBps
+            transport = stack.enter_context(closing(HttpTransport(access.url, self.name, outbox.agent, shown)))
+            if follows_fleet:
+                self.fleet = FleetView(FleetClient(access.url, shown), self.name, self._place, budget_kBps)
+                stack.enter_context(closing(self.fleet)).start()
+                self._joint = JointMap(self.fleet, self._config.map)
+        assert transport is not None
+        uplink = Uplink(
+            self._frontend,
+            outbox,
+            transport,
+            folder,
+            np.random.default_rng(),  # not the seed of the configuration: robots must not retry at the same moments
+            self._clock,
+            self._map_poses.correct_by_server,
+            outbox.begin(wiring.recording, wiring.resumes),
+            budget_kBps,
+        )
+        stack.callback(uplink.close)
+        return uplink
 
     def _require_own_map(self) -> OwnMap:
         if self._own is None:
@@ -393,7 +403,7 @@ class Robot(LiveTracker):
 
     def _is_behind(self) -> bool:
         uplink, own = self._uplink, self._own
-        unstored, is_full = (0, False) if uplink is None else (uplink.unstored, uplink.is_full)
+        unstored, is_full = (0, False) if uplink is None else (uplink.unstored, uplink.outbox.is_full)
         with self._lock:
             behind = max(self._frontend.packets.backlog, unstored, 0 if own is None else own.backlog) > LARGEST_BACKLOG
             if behind:
@@ -444,7 +454,7 @@ class Robot(LiveTracker):
         return None if pose is None or pose.map_index is None else (pose.map_index, pose.T_map_base)
 
     def _correct(self, session: int, correction: Correction) -> None:
-        is_server_away = self._uplink is None or self._uplink.trouble is not None
+        is_server_away = self._uplink is None or self._uplink.sender.trouble is not None
         self._map_poses.correct(session, correction, is_server_away)
 
     def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray | None) -> RobotPose:
@@ -496,13 +506,13 @@ class Robot(LiveTracker):
             return
         if self._uplink.failure is not None:
             self._tell_failure(f"nothing is sent or kept any more: {self._uplink.failure}")
-        trouble, was_online = self._uplink.trouble, self._is_online
-        if trouble is None and was_online is not True and self._uplink.status().confirmed:
+        sender, was_online = self._uplink.sender, self._is_online
+        if sender.trouble is None and was_online is not True and sender.confirmed:
             self._is_online = True
             self._event(EventKind.ONLINE, "the server confirms packets")
-        elif trouble not in (None, CONNECTING) and was_online is not False:
+        elif sender.trouble not in (None, CONNECTING) and was_online is not False:
             self._is_online = False
-            self._event(EventKind.OFFLINE, f"the robot goes on, and its packets wait: {trouble}")
+            self._event(EventKind.OFFLINE, f"the robot goes on, and its packets wait: {sender.trouble}")
 
     def _tell_correction(self, before: Correction | None, now: Correction) -> None:
         is_new_floor = self._frontend.scan_poses.is_new_floor
@@ -526,11 +536,11 @@ def _check_floor(floor: str) -> None:
         raise InputError(str(error)) from error
 
 
-def _keyframe_folder(state: Path | None, playback: Playback) -> Path:
+def _keyframe_folder(state: Path | None, resumes: bool) -> Path:
     if state is None:
         raise InputError("a robot that learns keeps keyframes; give --state, in Python state=")
     folder = state / KEYFRAMES
-    if not playback.resume:
+    if not resumes:
         shutil.rmtree(folder, ignore_errors=True)
     return folder
 

@@ -173,15 +173,6 @@ class Outbox:
                 connection.execute("INSERT INTO packets VALUES (?, ?, ?, ?, ?)", row)
         return dropped
 
-    def complete_sessions(self) -> list[bytes]:
-        """The packets of all earlier starts of which no packet left this file, in the order of their sessions."""
-        question = (
-            "SELECT data FROM packets JOIN sessions USING (epoch) WHERE epoch < ? AND stored = 0 AND sequence NOT NULL "
-            "AND epoch NOT IN (SELECT epoch FROM packets WHERE data IS NULL AND sequence NOT NULL) "
-            "ORDER BY epoch, sequence"
-        )
-        return [bytes(data) for (data,) in self._rows(question, (self.first_epoch,))]
-
     def record_detector_update(self, record: int, file: DetectorFile) -> None:
         """Store that the front end applied a detector update before this record of the session."""
         row = (self.epoch, record, file.channel.value, file.version, file.format, file.size, file.sha256)
