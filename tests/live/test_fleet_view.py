@@ -90,10 +90,10 @@ def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service
             assert [mate.robot for mate in first.robots()] == ["a", "b"]
             assert first.map_index == second.map_index == 0
             other = first.robots()[1]
-            assert first.teammates.robots == {"b"}
-            (place,) = first.teammates.places
+            (place,) = first.teammates(0)
             assert np.array_equal(place[:2], other.T_map_base[:2])
-            assert 0.0 <= place[2] <= other.age_s
+            assert 0.0 <= other.age_s <= place[2]
+            assert not len(first.teammates(1))
             assert first.news == ["map 0 holds a", "map 0 holds a, b; joined: b"]
             before = first.received_bytes
             follow(first)

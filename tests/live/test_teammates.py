@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, cast, classify
-from fcslam.live.fleet_view import MapTeammates
-from fcslam.live.joint_map import JointMap
+from fcslam.live.joint_map import OLDEST_S, JointMap, beams_on_teammates
 from fcslam.live.map_poses import CorrectedOdometry
-from fcslam.live.teammates import OLDEST_S, beams_on_teammates
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import Correction, Keyscan, LaserModel, LaserScan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
@@ -53,7 +51,7 @@ def joint():
 
 
 def on(scan, joint, *teammates, pose=HERE):
-    found = beams_on_teammates(scan, pose, scan.T_odom_base, np.array(teammates), 0.0, joint, 0.35)
+    found = beams_on_teammates(scan, pose, scan.T_odom_base, np.array(teammates), joint, 0.35)
     return np.zeros(360, bool) if found is None else found
 
 
@@ -91,13 +89,13 @@ class Fleet:
 
     def __init__(self, joint):
         self.joint_map, self.news, self.map_index, self.drawn_s = joint, [], 0, -np.inf
-        self.teammates = None
-
-    def clock(self):
-        return 0.0
+        self._teammates = np.empty((0, 3))
 
     def hear(self, *teammates):
-        self.teammates = MapTeammates(0, frozenset("b"), np.array(teammates), 0.0)
+        self._teammates = np.array(teammates)
+
+    def teammates(self, map_index):
+        return self._teammates
 
 
 def corridor_map():

@@ -17,7 +17,7 @@ from fcslam.learning.revisits import Keyframe
 from fcslam.mission.driving import legs
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import FloatArray
-from fcslam.robot.backend import BackendInput, RobotBackend, SessionEnd
+from fcslam.robot.backend import BackendInput, RobotBackend, Task
 from fcslam.robot.backend_runner import inline
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.keyframe_folder import KeyframeImage
@@ -67,7 +67,7 @@ class _Keeping:
 
     def submit(self, input: BackendInput) -> "Future[list[Body]]":
         """As the back end does."""
-        if isinstance(input, SessionEnd) and self.kept is None:
+        if input is Task.END_SESSION and self.kept is None:
             self.kept = self._backend.keyframes
         return self._submit(input)
 

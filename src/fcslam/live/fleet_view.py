@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -47,18 +47,6 @@ class Teammate:
     """Time since it was there."""
 
 
-class MapTeammates(NamedTuple):
-    """The map that a robot is in, and the others in it, as the cloud knows them at one moment."""
-
-    map_index: int
-    robots: frozenset[str]
-    """The others."""
-    places: FloatArray
-    """One row for each of them: x and y in the map, metres, and the age of its pose, seconds; shape (N, 3)."""
-    moment_s: float
-    """The moment, by the clock of the view."""
-
-
 class FleetView:
     """Follows the fleet of one robot. Any thread may call."""
 
@@ -81,8 +69,6 @@ class FleetView:
         self._tiled, self._etag = TiledMap(), ""
         self._reply: tuple[FleetReply, float] | None = None
         """The newest one and when it came."""
-        self.teammates: MapTeammates | None = None
-        """As the newest reply says; None if the robot is in no map that the cloud draws."""
         self.joint_map: OccupancyMap | None = None
         """The joint map of the newest tiles, in its own frame; None before all tiles of that frame came."""
         self._is_settling = False
@@ -124,7 +110,13 @@ class FleetView:
     @property
     def map_index(self) -> int | None:
         """Index of the map that the robot is in, as the cloud draws it; None if it is in none."""
-        return None if self.teammates is None else self.teammates.map_index
+        reply = () if self._reply is None else self._reply[0].robots
+        return next((one.map_index for one in reply if one.robot == self._robot), None)
+
+    def teammates(self, map_index: int | None) -> FloatArray:
+        """The other robots in a map: x and y there, metres, and the age of the pose, seconds; shape (N, 3)."""
+        others = [one for one in self.robots() if one.map_index == map_index and one.robot != self._robot]
+        return np.array([(*one.T_map_base[:2], one.age_s) for one in others], np.float64).reshape(-1, 3)
 
     def robots(self) -> list[Teammate]:
         """All robots that the cloud knows, with the ages of their poses now."""
@@ -163,9 +155,9 @@ class FleetView:
             self._is_settling = (self._is_settling or is_new) and not is_complete
             self.joint_map = None if self._is_settling else self._tiled.occupancy()
             self.version += 1
-        before, self._reply = self.teammates, reply
-        self.teammates = _map_teammates(self._robot, *reply)
-        self._tell(before, self.teammates)
+        before = self._in_map()
+        self._reply = reply
+        self._tell(before, self._in_map())
         if is_complete:  # the poses came before the tiles, so the tiles hold at least this keyscan
             self.drawn_s = stamp
         if self.clock() - self._frontiers_s >= FRONTIERS_S:
@@ -185,11 +177,16 @@ class FleetView:
                 self.trouble, self._failures = str(error), self._failures + 1
                 wait_s = getattr(error, "retry_after_s", 0.0) + POLL_S + retry_delay_s(self._failures, self._rng)
 
-    def _tell(self, before: MapTeammates | None, now: MapTeammates | None) -> None:
-        known = {one.robot for one in self.robots()}
-        earlier, others = (frozenset() if one is None else one.robots for one in (before, now))
-        if earlier == others and (before is None) == (now is None):
+    def _in_map(self) -> frozenset[str] | None:
+        """The robots in the map that the robot is in; None if it is in none."""
+        index = self.map_index
+        return None if index is None else frozenset(one.robot for one in self.robots() if one.map_index == index)
+
+    def _tell(self, before: frozenset[str] | None, now: frozenset[str] | None) -> None:
+        if before == now:
             return
+        known, itself = {one.robot for one in self.robots()}, {self._robot}
+        earlier, others = ((robots or frozenset()) - itself for robots in (before, now))
         if now is None:
             line = "this robot is in no joint map any more"
         else:
@@ -201,15 +198,6 @@ class FleetView:
             if gone := earlier - others - known:
                 parts.append(f"taken out: {', '.join(sorted(gone))}")
             everybody = ", ".join(sorted(others | {self._robot}))
-            line = f"map {now.map_index} holds {everybody}" + "".join(f"; {part}" for part in parts)
+            line = f"map {self.map_index} holds {everybody}" + "".join(f"; {part}" for part in parts)
         if len(self.news) < MOST_NEWS:
             self.news.append(line)
-
-
-def _map_teammates(robot: str, reply: FleetReply, came_s: float) -> MapTeammates | None:
-    own = next((one.map_index for one in reply.robots if one.robot == robot), None)
-    if own is None:
-        return None
-    others = [one for one in reply.robots if one.map_index == own and one.robot != robot]
-    places = np.array([(*one.T_map_base[:2], one.age_s) for one in others], np.float64).reshape(-1, 3)
-    return MapTeammates(own, frozenset(one.robot for one in others), places, came_s)

@@ -4,39 +4,36 @@ import threading
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, draw_over
+from fcslam.lidar.scan import rays_of
 from fcslam.live.fleet_view import FleetView
 from fcslam.live.map_poses import CorrectedOdometry
 from fcslam.live.records import RobotPose
-from fcslam.live.teammates import beams_on_teammates
 from fcslam.maps.joint_tiles import padded
-from fcslam.maps.occupancy_map import OccupancyMap
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, without
 from fcslam.robot.track import ScanTrack
 from fcslam.warmup import made_up_scans
 from fcslam.wire.messages import Hello, Packet
 
+OLDEST_S = 2.0
+"""An older pose does not say where a robot is now."""
+SPEED_MPS = 0.5
+"""By how much the place of a robot grows with the age of its pose."""
+WALL_CELLS = 2
+"""A point so few cells from an occupied cell is of that wall."""
+FREE, OCCUPIED = int(Occupancy.FREE), int(Occupancy.OCCUPIED)
 MOST_DRAWN = 20_000
 """Most keyscans that wait to be drawn by the cloud: hours of an outage."""
 MOST_MET = 1000
 """Scans that saw other robots and may become keyscans yet."""
-
-
-class _DrawnKeyscan(NamedTuple):
-    """A keyscan that the cloud may not have drawn yet."""
-
-    session: int
-    keyscan: Keyscan
-    laser: LaserModel
-    on_teammates: NDArray[np.bool_] | None
-    """As in ``LaserScan``."""
 
 
 _ScanKey = tuple[float, tuple[float, float, float], int]
@@ -51,8 +48,9 @@ class JointMap:
 
     def __init__(self, fleet: FleetView, config: OccupancyConfig) -> None:
         self._fleet, self._config = fleet, config
-        self._drawn: deque[_DrawnKeyscan] = deque(maxlen=MOST_DRAWN)
-        """Keyscans that the joint map of the cloud may not show yet."""
+        self._drawn: deque[tuple[int, Keyscan, LaserModel]] = deque(maxlen=MOST_DRAWN)
+        """Session and laser of keyscans that the joint map of the cloud may not show yet, without returns from other
+        robots."""
         self._lasers: tuple[LaserModel, ...] = ()
         """As the robot announced them last."""
         self._newest: tuple[int, FloatArray] | None = None
@@ -61,7 +59,7 @@ class JointMap:
         """Beams of the newest scans that hit other robots."""
         self._lock = threading.Lock()
         (scan,), here, cell = made_up_scans(1), se2.IDENTITY, OccupancyMap(np.zeros((1, 1), np.uint8), 0.05, (0.0, 0.0))
-        beams_on_teammates(scan, here, here, np.zeros((1, 3)), 0.0, cell, 0.5)  # no scan waits for the compiler
+        beams_on_teammates(scan, here, here, np.zeros((1, 3)), cell, 0.5)  # no scan waits for the compiler
 
     def add(self, packets: Iterable[Packet]) -> None:
         """Keep the next keyscans until the cloud has drawn them."""
@@ -71,9 +69,9 @@ class JointMap:
                 self._lasers = keyscan.lasers
             elif isinstance(keyscan, Keyscan):
                 laser = keyscan.laser_model(self._lasers)
-                on_teammates = self._met.pop(_key(keyscan.stamp, laser), None)
+                ranges_m = without(keyscan.ranges_m, self._met.pop(_key(keyscan.stamp, laser), None))
                 with self._lock:
-                    self._drawn.append(_DrawnKeyscan(packet.epoch, keyscan, laser, on_teammates))
+                    self._drawn.append((packet.epoch, replace(keyscan, ranges_m=ranges_m), laser))
 
     def draw(self, session: int, track: ScanTrack, localizer: CorrectedOdometry) -> OccupancyMap | None:
         """The joint map, with the keyscans of a session of the robot drawn into it that the cloud has not drawn yet.
@@ -84,13 +82,12 @@ class JointMap:
         if joint is None or fleet.map_index is None or fleet.map_index != localizer.map_index:
             return None
         with self._lock:
-            while self._drawn and self._drawn[0].keyscan.stamp <= fleet.drawn_s:
+            while self._drawn and self._drawn[0][1].stamp <= fleet.drawn_s:
                 self._drawn.popleft()
-            waiting = [one for one in self._drawn if one.session == session]
+            waiting = [(keyscan, laser) for its_session, keyscan, laser in self._drawn if its_session == session]
         lately = [
-            Casting(ranges_m, laser, moved, keyscan.sweep)
-            for _, keyscan, laser, on_teammates in waiting
-            for ranges_m in [without(keyscan.ranges_m, on_teammates)]
+            Casting(keyscan.ranges_m, laser, moved, keyscan.sweep)
+            for keyscan, laser in waiting
             for T_odom_base in [track.in_odom(ScanPose(keyscan.stamp, keyscan.id.number, se2.IDENTITY))]
             if (moved := localizer.T_map_base(T_odom_base)) is not None
         ]
@@ -103,18 +100,117 @@ class JointMap:
         """
         fleet, radius_m = self._fleet, self._config.robot_radius_m
         before, self._newest = self._newest, (session, scan.T_odom_base)
-        joint, teammates = fleet.joint_map, fleet.teammates
-        if joint is None or teammates is None or newest is None or radius_m <= 0.0:
+        joint = fleet.joint_map
+        if joint is None or newest is None or before is None or before[0] != session or radius_m <= 0.0:
             return scan
-        if before is None or before[0] != session:
+        if fleet.map_index != newest.map_index:  # the joint map is that of the fleet
             return scan
-        if teammates.map_index != newest.map_index:  # the joint map is that of the teammates
-            return scan
-        places, since_s = teammates.places, fleet.clock() - teammates.moment_s
-        on_teammates = beams_on_teammates(scan, newest.T_map_base, before[1], places, since_s, joint, radius_m)
+        places = fleet.teammates(newest.map_index)
+        on_teammates = beams_on_teammates(scan, newest.T_map_base, before[1], places, joint, radius_m)
         if on_teammates is None:
             return scan
         self._met[_key(scan.stamp, scan.laser)] = on_teammates
         while len(self._met) > MOST_MET:
             del self._met[next(iter(self._met))]
         return replace(scan, on_teammates=on_teammates)
+
+
+def beams_on_teammates(
+    scan: LaserScan,
+    T_map_before: FloatArray,
+    T_odom_before: FloatArray,
+    places: FloatArray,
+    joint: OccupancyMap,
+    radius_m: float,
+) -> NDArray[np.bool_] | None:
+    """Which beams hit another robot, shape (beam_count,); None if none does: scans must not be matched by them.
+
+    A robot that drives along with this one would look like a wall that stands still. The points stay in the scan:
+    whether the map shows them is decided where the scans of all robots are known (``fcslam.maps.teammates``).
+
+    A pose alone takes no point away, as it may be false. A point counts only if the joint map says that the floor is
+    free there, and no wall is near it. So nobody hides a wall of the map. What is new on that floor, such as a closed
+    door, does not count while a robot says that it is there.
+
+    Args:
+        scan: the scan; its odometry says how far the robot drove since the scan before.
+        T_map_before: where the scan before was made, in the frame of ``joint``, shape (3,); read-only, as in a record.
+        T_odom_before: its odometry, shape (3,); read-only.
+        places: of the other robots in that map: x, y and the age of their poses, shape (N, 3), metres and seconds.
+        joint, radius_m: the joint map, and the radius of a robot.
+    """
+    origins, directions = rays_of(scan.laser, scan.sweep)
+    found: NDArray[np.bool_] | None = _on_discs(
+        scan.ranges_m,
+        origins,
+        directions,
+        scan.laser.max_range_m,
+        T_map_before,
+        T_odom_before,
+        scan.T_odom_base,
+        places,
+        radius_m,
+        joint.cells,
+        joint.origin_xy,
+        joint.resolution_m,
+    )
+    return found
+
+
+@njit
+def _on_discs(  # type: ignore[no-untyped-def]
+    ranges, origins, directions, reach, T_map_before, T_odom_before, T_odom_base,
+    places, radius, cells, corner, side,
+):  # fmt: skip
+    """Whether each return lies on the free floor of a map, where a robot may be; None if none does."""
+    pose_x, pose_y, pose_theta = _driven_on(T_map_before, T_odom_before, T_odom_base)
+    cos, sin = np.cos(pose_theta), np.sin(pose_theta)
+    near = np.empty((len(places), 3))  # x and y in ``base``, and the square of its radius
+    count = 0
+    for k in range(len(places)):
+        dx, dy, age = places[k, 0] - pose_x, places[k, 1] - pose_y, places[k, 2]
+        limit = radius + SPEED_MPS * age
+        if age <= OLDEST_S and np.hypot(dx, dy) <= reach + limit:
+            near[count] = cos * dx + sin * dy, cos * dy - sin * dx, limit * limit
+            count += 1
+    if count == 0:
+        return None
+    found, is_any = np.zeros(len(ranges), np.bool_), False
+    for i in range(len(ranges)):
+        r = ranges[i]
+        if not 0.0 < r < reach:
+            continue
+        x, y = origins[i, 0] + r * directions[i, 0], origins[i, 1] + r * directions[i, 1]
+        for k in range(count):
+            if (x - near[k, 0]) ** 2 + (y - near[k, 1]) ** 2 <= near[k, 2]:
+                right, up = pose_x + cos * x - sin * y - corner[0], pose_y + sin * x + cos * y - corner[1]
+                found[i] = _is_floor(right, up, cells, side)
+                is_any = is_any or found[i]
+                break
+    return found if is_any else None
+
+
+@njit(allocates=False)
+def _driven_on(T_map_before, T_odom_before, T_odom_base):  # type: ignore[no-untyped-def]
+    """x, y and theta in ``map`` after a motion by odometry."""
+    dx, dy, turned = (
+        T_odom_base[0] - T_odom_before[0],
+        T_odom_base[1] - T_odom_before[1],
+        T_map_before[2] - T_odom_before[2],
+    )
+    cos, sin = np.cos(turned), np.sin(turned)  # of ``odom`` in ``map``
+    return T_map_before[0] + cos * dx - sin * dy, T_map_before[1] + sin * dx + cos * dy, turned + T_odom_base[2]
+
+
+@njit(allocates=False)
+def _is_floor(x, y, cells, side):  # type: ignore[no-untyped-def]
+    """Whether a point lies in a free cell without a wall beside it; x and y from the map's lower left corner."""
+    height, width = cells.shape
+    row, column = int(np.floor(y / side)), int(np.floor(x / side))
+    if not (0 <= row < height and 0 <= column < width) or cells[row, column] != FREE:
+        return False
+    for r in range(max(0, row - WALL_CELLS), min(height, row + WALL_CELLS + 1)):
+        for c in range(max(0, column - WALL_CELLS), min(width, column + WALL_CELLS + 1)):
+            if cells[r, c] == OCCUPIED:
+                return False
+    return True

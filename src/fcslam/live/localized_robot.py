@@ -24,7 +24,7 @@ from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.mission.localization import LocalizedDrive, pose_in_map, read_map
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import FloatArray, StrPath, frozen
-from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd
+from fcslam.robot.backend import BackendInput, NewKeyscan, Task
 from fcslam.robot.backend_runner import WorkerObject
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
@@ -186,7 +186,7 @@ class LocalizedRobot(LiveTracker):
 
     def _submit(self, input: BackendInput) -> "Future[list[Body]]":
         self._keyscans += isinstance(input, NewKeyscan)
-        self._submitted_sessions += isinstance(input, SessionEnd)
+        self._submitted_sessions += input is Task.END_SESSION
         return self._queue(MapLocalizer.submit, input)
 
     def _queue(self, method: Callable[..., object], argument: object) -> "Future[list[Body]]":

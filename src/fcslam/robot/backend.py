@@ -5,7 +5,8 @@ their order, so it gives the same records wherever and whenever it runs (``fcsla
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum, auto
 from pathlib import Path
 from typing import Annotated
 
@@ -35,7 +36,7 @@ from fcslam.records import (
 from fcslam.robot.keyframe_folder import KeyframeFolder, KeyframeImage
 from fcslam.robot.own_places import OwnPlaces
 from fcslam.robot.tag_detection import TagDetector, TagsConfig
-from fcslam.robot.views import CameraView, ViewExtractor, ViewsConfig
+from fcslam.robot.views import ViewExtractor, ViewsConfig
 from fcslam.wire.messages import Body, Hello
 
 
@@ -91,20 +92,19 @@ class NewDetector:
     path: Path
 
 
-@dataclass(frozen=True, slots=True)
-class PlaceKeyframes:
+class Task(Enum):
+    """What a back end does between two records."""
+
+    PLACE_KEYFRAMES = auto()
     """Write where the keyframes of the present session are; the robot stands still and may learn from them."""
-
-
-@dataclass(frozen=True, slots=True)
-class SessionEnd:
-    """The present session ends; the next keyscan begins another one."""
+    END_SESSION = auto()
+    """The next keyscan begins another session."""
 
 
 PLACED_AFTER, PLACED_AFTER_SHARE = 20, 0.1
 """Keyframes after which the poses of all are written again, and as a share of those that there are."""
 
-BackendInput = NewKeyscan | NewImage | KeyscanFix | NewDetector | PlaceKeyframes | SessionEnd
+BackendInput = NewKeyscan | NewImage | KeyscanFix | NewDetector | Task
 
 
 class RobotBackend:
@@ -119,7 +119,7 @@ class RobotBackend:
         self._robot = robot
         self._config = config
         self._folder = None if keyframes is None else KeyframeFolder(keyframes)
-        self._view_extractor = ViewExtractor(config.views, self._folder)
+        self._view_extractor = ViewExtractor(robot, config.views, self._folder)
         self._unplaced = self._placed = 0
         """Keyframes since their poses were written last, and all until then."""
         self._session = _Session(robot, 0, self._view_extractor, config)
@@ -148,9 +148,9 @@ class RobotBackend:
             case NewDetector():
                 self._set_detector(input.file, input.path)
                 return self._session.announcement()
-            case PlaceKeyframes():
+            case Task.PLACE_KEYFRAMES:
                 self._place()
-            case SessionEnd():
+            case Task.END_SESSION:
                 rest = self._session.finish()
                 self._place()
                 if self._folder is not None:
@@ -188,8 +188,8 @@ class _Session:
         self._lidar = LidarBackend(robot, config.lidar, self._own_places)
         self._lasers: tuple[LaserModel, ...] = ()
         self._view_extractor = view_extractor
-        self._views: list[CameraView] = []
-        """Views that wait until the submap around them is complete."""
+        self._views: list[Place] = []
+        """Places of images that wait until the submap around them is complete."""
         self._submaps: dict[int, tuple[int, int]] = {}
         """By keyscan of a camera place: first and last keyscan of the submap that it was sent with."""
         self._described: set[tuple[int, str]] = set()
@@ -241,11 +241,11 @@ class _Session:
         bodies: list[Body] = list(submap.closures)
         if Channel.LIDAR in self._config.channels:
             bodies.append(self._lidar_place(submap))
-        complete = [view for view in self._views if at_end or view.keyscan <= submap.anchor]
+        complete = [view for view in self._views if at_end or view.id.number <= submap.anchor]
         self._views = self._views[len(complete) :]
         # A view outside of every submap is not a place: the robot may have jumped between two scans.
-        shown = [view for view in complete if submap.first <= view.keyscan <= submap.last]
-        self._submaps |= {view.keyscan: (submap.first, submap.last) for view in shown}
+        shown = [view for view in complete if submap.first <= view.id.number <= submap.last]
+        self._submaps |= {view.id.number: (submap.first, submap.last) for view in shown}
         return [*bodies, *(self._camera_place(view) for view in shown)]
 
     def announcement(self) -> list[Body]:
@@ -257,10 +257,10 @@ class _Session:
         self._announced = hello
         if before is not None and hello.detector_versions == before.detector_versions:
             return [hello]
-        views = {view.keyscan: view for view in self._view_extractor.describe_again()} if self._submaps else {}
-        self._views = [views.get(view.keyscan, view) for view in self._views]
-        sent = [view for view in views.values() if view.keyscan in self._submaps]
-        fresh = [view for view in sent if (view.keyscan, view.detector_version) not in self._described]
+        views = {view.id: view for view in self._view_extractor.describe_again()} if self._submaps else {}
+        self._views = [views.get(view.id, view) for view in self._views]
+        sent = [view for view in views.values() if view.id.number in self._submaps]
+        fresh = [view for view in sent if (view.id.number, view.detector_version) not in self._described]
         return [hello, *(self._camera_place(view) for view in fresh)]
 
     def _lidar_place(self, submap: FinishedSubmap) -> Place:
@@ -268,10 +268,10 @@ class _Session:
         described = features.keypoints_m, features.descriptors
         return Place(keyscan, Channel.LIDAR, DETECTOR_VERSION, submap.first, submap.last, *described)
 
-    def _camera_place(self, view: CameraView) -> Place:
-        self._described.add((view.keyscan, view.detector_version))
-        keyscan, span = KeyscanId(self._robot, view.keyscan), self._submaps[view.keyscan]
-        return Place(keyscan, Channel.CAMERA, view.detector_version, *span, view.keypoints, view.descriptors)
+    def _camera_place(self, view: Place) -> Place:
+        self._described.add((view.id.number, view.detector_version))
+        first, last = self._submaps[view.id.number]
+        return replace(view, first=first, last=last)
 
     def _hello(self) -> Hello:
         known = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_extractor.detector_version}

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Final, NamedTuple, TypeGuard
+from typing import Final, TypeGuard
 
 import numpy as np
 
@@ -77,21 +77,21 @@ class Calibrated:
 def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     """Estimate the timing and the mounting of the first laser of a bag with one laser."""
     contradictions = _contradictions(bag)
-    floors = tuple(found.floor for found in contradictions)
+    floors = tuple(floor for _, floor in contradictions)
     if not any(floors):
-        return _calibrate_level(bag, config, contradictions)
+        return _calibrate_level(bag, config, [facing for facing, _ in contradictions])
     level = bag.corrected(BagCorrection(floors=floors), ())
-    calibrated = _calibrate_level(level, config, _contradictions(level))
+    calibrated = _calibrate_level(level, config, [facing for facing, _ in _contradictions(level)])
     lines = (*(f"{floor}; its returns are left out" for floor in filter(None, floors)), *calibrated.lines)
     return replace(calibrated, correction=replace(calibrated.correction, floors=floors), lines=lines)
 
 
-def _calibrate_level(bag: RosBag, config: LidarConfig, contradictions: "list[_Found]") -> Calibrated:
-    if len(contradictions) > 1:
-        named = zip(bag.plan.lasers, contradictions, strict=True)
-        lines = tuple(f"{laser.name}: {found.facing}; not corrected" for laser, found in named if found.facing)
+def _calibrate_level(bag: RosBag, config: LidarConfig, facings: list[Contradiction | None]) -> Calibrated:
+    if len(facings) > 1:
+        named = zip(bag.plan.lasers, facings, strict=True)
+        lines = tuple(f"{laser.name}: {found}; not corrected" for laser, found in named if found)
         return Calibrated(MotionCalibration(), BagCorrection(), lines)
-    found = contradictions[0].facing
+    (found,) = facings
     if found is None:
         return _calibrate_finely(bag, config)
     if found.facing == AS_STATED:
@@ -116,14 +116,14 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
     """Lines about the lasers of a recording of any format that contradict its odometry."""
     say = str if isinstance(source, RosBag) else _without_tf
     lines = []
-    for laser, found in zip(source.survey().lasers, _contradictions(source), strict=True):
-        if found.facing is not None:
-            lines.append(say(found.facing))
-        if found.floor is not None:
-            middle_deg = round(math.degrees(se2.wrap_angle(found.floor.heading_rad + laser.T_base_laser[2])))
+    for laser, (facing, floor) in zip(source.survey().lasers, _contradictions(source), strict=True):
+        if facing is not None:
+            lines.append(say(facing))
+        if floor is not None:
+            middle_deg = round(math.degrees(se2.wrap_angle(floor.heading_rad + laser.T_base_laser[2])))
             ignored = [middle_deg - FLOOR_HALF_DEG, middle_deg + FLOOR_HALF_DEG]
             lines.append(
-                f"{found.floor}, or leave its beams out by the configuration: robot: {{lidar: {{ignore: [{ignored}]}}}}"
+                f"{floor}, or leave its beams out by the configuration: robot: {{lidar: {{ignore: [{ignored}]}}}}"
             )
     return tuple(f"{source.name}: {line}" for line in lines)
 
@@ -154,16 +154,12 @@ def _scans_of(laser: LaserModel, source: Source) -> Iterator[LaserScan]:
     return (each for each in source.records() if isinstance(each, LaserScan) and is_same_laser(each.laser, laser))
 
 
-class _Found(NamedTuple):
-    facing: Contradiction | None
-    floor: FloorLine | None
-
-
-def _contradictions(source: Source) -> list[_Found]:
+def _contradictions(source: Source) -> list[tuple[Contradiction | None, FloorLine | None]]:
+    """What contradicts the facing of each laser, and the floor that it sees."""
     found = []
     for laser in source.survey().lasers:
         first = list(islice(_scans_of(laser, source), MOST_COMPARED))
-        found.append(_Found(contradicted_facing(first), floor_line(first)))
+        found.append((contradicted_facing(first), floor_line(first)))
     return found
 
 

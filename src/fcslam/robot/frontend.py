@@ -24,7 +24,7 @@ from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.lost import LostConfig, has_moved_unseen
 from fcslam.lidar.tracker import TrackedScan, TrackingResult
 from fcslam.records import CameraImage, DetectorFile, GnssFix, LaserScan, SensorRecord
-from fcslam.robot.backend import BackendInput, NewDetector, PlaceKeyframes, RobotBackend, SessionConfig, SessionEnd
+from fcslam.robot.backend import BackendInput, NewDetector, RobotBackend, SessionConfig, Task
 from fcslam.robot.backend_runner import Submit, inline
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.packet_queue import PacketQueue
@@ -139,7 +139,7 @@ class RobotFrontend:
 
     def place_keyframes(self) -> None:
         """Have the back end write where the keyframes are, if it keeps them."""
-        self._submit(PlaceKeyframes())
+        self._submit(Task.PLACE_KEYFRAMES)
 
     def change_floor(self, floor: str) -> None:
         """Go on in a new session on another floor, 1 to 16 letters, digits and ``. _ + -``; empty: without a name."""
@@ -160,7 +160,7 @@ class RobotFrontend:
     def finish(self) -> list[Packet]:
         """End the recording; returns all packets that are left."""
         self._end_deferral()
-        self._submit(SessionEnd())
+        self._submit(Task.END_SESSION)
         return self.ready(wait=True)
 
     def _begin_where_unconnected(self, scan: LaserScan) -> None:
@@ -286,7 +286,7 @@ class RobotFrontend:
             self._submit(view)
 
     def _end_session(self) -> None:
-        self._submit(SessionEnd())
+        self._submit(Task.END_SESSION)
         self._begin(ScanTrack(self.scan_poses.floor))
 
     def _begin(self, track: ScanTrack) -> None:

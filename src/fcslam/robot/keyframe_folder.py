@@ -1,11 +1,9 @@
-"""Keyframes of the camera, in memory and on the robot's own disk. They never leave the robot.
+"""Keyframes of the camera on the robot's own disk, for the process that learns beside it. They never leave the robot.
 
-The buffer in memory is for a new detector, which describes the images again; the disk is for the process that learns
-beside the robot: one file for each keyframe, and one for each session with the poses of its keyscans.
+There is one file for each keyframe, and one for each session with the poses of its keyscans.
 """
 
 import logging
-from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -23,8 +21,6 @@ KEYFRAMES: Final = "keyframes"
 """Folder of the keyframes, below a robot's state folder."""
 FITS: Final = "fcslam keyframes 1"
 _POSES, _SUFFIX = "poses", ".state"
-MOST_IMAGES, MOST_BYTES = 500, 32_000_000
-"""Size of the buffer, which is in memory: images, and bytes of all encoded images together."""
 _log = logging.getLogger(__name__)
 
 
@@ -39,29 +35,6 @@ class KeyframeImage:
     """LiDAR returns of each laser in the base at the time of the image."""
     T_keyscan_image: FloatArray
     """Pose of the base at the time of the image in the keyscan's base, shape (3,), metres and radians."""
-
-
-class ImageBuffer:
-    """The newest images, one a keyscan."""
-
-    def __init__(self) -> None:
-        self._images: dict[int, KeyframeImage] = {}
-        self._bytes = 0
-
-    def __iter__(self) -> Iterator[KeyframeImage]:
-        return iter(self._images.values())
-
-    def add(self, image: KeyframeImage) -> list[int]:
-        """Add the image of a keyscan that has none; drop the oldest images if the buffer is full, and return the
-        keyscans of these."""
-        self._images[image.keyscan] = image
-        dropped = []
-        self._bytes += len(image.encoded)
-        while len(self._images) > MOST_IMAGES or self._bytes > MOST_BYTES:
-            oldest = self._images.pop(next(iter(self._images)))
-            self._bytes -= len(oldest.encoded)
-            dropped.append(oldest.keyscan)
-        return dropped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,10 +81,9 @@ class KeyframeFolder:
         }
         self._write(self._path(image.keyscan), state)
 
-    def drop(self, keyscans: Iterable[int]) -> None:
-        """Remove keyframes of this session."""
-        for keyscan in keyscans:
-            self._path(keyscan).unlink(missing_ok=True)
+    def drop(self, keyscan: int) -> None:
+        """Remove a keyframe of this session."""
+        self._path(keyscan).unlink(missing_ok=True)
 
     def place(self, T_own_keyscan: FloatArray) -> None:
         """Write the poses of all keyscans of this session in the robot's own map, shape (N, 3)."""

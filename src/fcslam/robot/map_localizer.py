@@ -21,7 +21,7 @@ from fcslam.lidar.matching import match_scan
 from fcslam.lidar.submap import Submap, agreement, build_submap
 from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, SUPPORTED
 from fcslam.records import FloatArray, frozen
-from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd
+from fcslam.robot.backend import BackendInput, NewKeyscan, Task
 from fcslam.wire.messages import Body
 
 AGREES_M, AGREES_RAD = 0.5, 0.1
@@ -120,7 +120,7 @@ class MapLocalizer:
         match input:
             case NewKeyscan():
                 self._add(input.keyscan)
-            case SessionEnd():
+            case Task.END_SESSION:
                 self._lose()
                 self._begin()
         done: Future[list[Body]] = Future()

@@ -5,7 +5,7 @@ from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, replace
 
 from fcslam.errors import FeatureError
-from fcslam.robot.backend import BackendInput, NewKeyscan, SessionEnd, essential
+from fcslam.robot.backend import BackendInput, NewKeyscan, Task, essential
 from fcslam.robot.backend_runner import Submit
 from fcslam.robot.track import ScanTrack
 from fcslam.wire.messages import Body, Hello, Packet
@@ -72,7 +72,7 @@ class PacketQueue:
                 packet = Packet(self._robot, done.epoch, self._sequence, done.time, body)
                 packets.append(packet.on_floor(done.track.floor))
                 self._sequence += 1
-            if isinstance(done.input, SessionEnd):
+            if done.input is Task.END_SESSION:
                 self._sequence, self._hello = 0, None
         return packets
 

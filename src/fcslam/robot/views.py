@@ -2,11 +2,9 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from fcslam.config import Settings
@@ -18,8 +16,8 @@ from fcslam.features.lidar_depth import LidarView, locate_among
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.scan import point_scan
-from fcslam.records import CameraImage, Codes, DetectorFile, FloatArray, LaserScan, frozen
-from fcslam.robot.keyframe_folder import ImageBuffer, KeyframeFolder, KeyframeImage
+from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, KeyscanId, LaserScan, Place, frozen
+from fcslam.robot.keyframe_folder import KeyframeFolder, KeyframeImage
 
 SCAN_AGE_S = 1.0
 """Scans of several lasers that are older than the newest by more are not combined with it."""
@@ -27,6 +25,8 @@ EVERY_M, EVERY_RAD = 1.0, 0.5
 """Travel or turn after which an image becomes a camera place; after the turn, about half of the view is new."""
 FEWEST_KEYPOINTS = 20
 """Least number of keypoints with a position; an image with fewer is not a place."""
+MOST_IMAGES, MOST_BYTES = 500, 32_000_000
+"""Size of the buffer of images: their number, and the bytes of all encoded images together."""
 
 
 class ViewsConfig(Settings):
@@ -42,28 +42,20 @@ class ViewsConfig(Settings):
     )
 
 
-@dataclass(frozen=True, slots=True)
-class CameraView:
-    """The part of one keyframe image that leaves the robot."""
-
-    keyscan: int
-    keypoints: NDArray[np.float32]
-    """Shape (K, 3): x, y, z in metres in the keyscan's base."""
-    descriptors: Codes
-    """Shape (K, 32)."""
-    detector_version: str
-
-
 class ViewExtractor:
-    """Picks images that show something new and describes them."""
+    """Picks images that show something new and describes them as places of their keyscans alone.
 
-    def __init__(self, config: ViewsConfig, folder: KeyframeFolder | None = None) -> None:
+    It keeps the newest of them in a buffer. The images stay on the robot; places are what leaves it.
+    """
+
+    def __init__(self, robot: str, config: ViewsConfig, folder: KeyframeFolder | None = None) -> None:
         """Load the detector, if its library is installed. ``folder`` keeps the keyframes of the image buffer."""
-        self._config = config
+        self._robot, self._config = robot, config
         self._detector: FeatureDetector | None = None
         with suppress(MissingExtraError):  # then the first image says so, as a robot may have a LiDAR alone
             self._detector = self._make_detector()
-        self._image_buffer = ImageBuffer()
+        self._images: dict[int, KeyframeImage] = {}
+        """The image buffer, by keyscan, oldest first."""
         self._folder = folder
         self._last: tuple[int, FloatArray] | None = None
         """Keyscan and odometry of the last view."""
@@ -76,9 +68,7 @@ class ViewExtractor:
     def _make_detector(self) -> FeatureDetector:
         return make_detector(self._config.detector, OnnxConfig(weights=self._config.weights))
 
-    def describe(
-        self, image: CameraImage, scan: LaserScan, pose: ScanPose, scans: Sequence[LaserScan]
-    ) -> CameraView | None:
+    def describe(self, image: CameraImage, scan: LaserScan, pose: ScanPose, scans: Sequence[LaserScan]) -> Place | None:
         """Describe the next image.
 
         ``scan`` is the newest one before it, and ``scans`` are the newest of each laser. The motion between the scan
@@ -100,15 +90,14 @@ class ViewExtractor:
         keyframe = KeyframeImage(pose.keyscan, image.encoded, image.camera, surroundings, T_keyscan_image)
         view = self._describe(keyframe, picture)
         if view is not None:
-            dropped = self._image_buffer.add(keyframe)
-            if self._folder is not None:
-                self._folder.drop(dropped)
+            self._images[pose.keyscan] = keyframe
+            self._drop_oldest()
         return view
 
     @property
     def keyframes(self) -> tuple[KeyframeImage, ...]:
         """The buffered images of the present session, oldest first."""
-        return tuple(self._image_buffer)
+        return tuple(self._images.values())
 
     def set_detector(self, file: DetectorFile, path: Path) -> None:
         """Use a downloaded network from now on."""
@@ -116,16 +105,16 @@ class ViewExtractor:
 
     def reset(self) -> None:
         """Start a new session: forget all images."""
-        self._image_buffer = ImageBuffer()
+        self._images = {}
         self._last = None
 
-    def describe_again(self) -> list[CameraView]:
+    def describe_again(self) -> list[Place]:
         """Describe all buffered images with the present detector, oldest first."""
-        pictures = ((image, decode_grey(image.encoded)) for image in self._image_buffer)
+        pictures = ((image, decode_grey(image.encoded)) for image in self._images.values())
         views = (self._describe(image, picture) for image, picture in pictures if picture is not None)
         return [view for view in views if view is not None]
 
-    def _describe(self, image: KeyframeImage, picture: GreyImage) -> CameraView | None:
+    def _describe(self, image: KeyframeImage, picture: GreyImage) -> Place | None:
         self._detector = detector = self._detector or self._make_detector()
         features = detector.detect(picture)
         positions, placed = locate_among(features.keypoints_px, image.camera, image.surroundings)
@@ -135,7 +124,14 @@ class ViewExtractor:
             self._folder.keep(image, features, detector.version)
         positions[:, :2] = se2.transform(image.T_keyscan_image, positions[:, :2])
         keypoints, codes = frozen(positions[placed], np.float32), frozen(features.descriptors[placed], np.uint8)
-        return CameraView(image.keyscan, keypoints, codes, detector.version)
+        number = image.keyscan
+        return Place(KeyscanId(self._robot, number), Channel.CAMERA, detector.version, number, number, keypoints, codes)
+
+    def _drop_oldest(self) -> None:
+        for keyscan in list(self._images)[: surplus([len(image.encoded) for image in self._images.values()])]:
+            del self._images[keyscan]
+            if self._folder is not None:
+                self._folder.drop(keyscan)
 
     def _is_new(self, keyscan: int, T_odom_base: FloatArray) -> bool:
         if self._last is None:
@@ -144,6 +140,12 @@ class ViewExtractor:
         motion = se2.between(T_odom_last, T_odom_base)
         moved = np.hypot(motion[0], motion[1]) >= EVERY_M or abs(motion[2]) >= EVERY_RAD
         return bool(moved) and keyscan > seen_from
+
+
+def surplus(sizes: Sequence[int]) -> int:
+    """How many of the oldest images, of these sizes in bytes, the buffer has no room for."""
+    newest_bytes = np.cumsum(sizes[::-1])
+    return len(sizes) - min(MOST_IMAGES, int(np.searchsorted(newest_bytes, MOST_BYTES, side="right")))
 
 
 def _lidar_view(scan: LaserScan, T_odom_image: FloatArray) -> LidarView:
