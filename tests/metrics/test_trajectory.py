@@ -9,7 +9,6 @@ from fcslam.geometry import se2
 from fcslam.metrics.relations import PoseTable
 from fcslam.metrics.trajectory import (
     PositionErrors,
-    TrajectoryPair,
     align,
     interpolate,
     near_pairs,
@@ -118,7 +117,7 @@ def test_placement_is_what_one_robot_would_have_to_be_moved():
         a, b = walk(1), walk(2) if b is None else b
         frame = (7.0, -4.0, 1.2)
         estimates = se2.compose(frame, a), se2.compose(frame, se2.compose(moved, b))
-        return placement_error(TrajectoryPair(a, estimates[0]), TrajectoryPair(b, estimates[1]))
+        return placement_error((a, estimates[0]), (b, estimates[1]))
 
     assert error((0.0, 0.0, 0.0)) == pytest.approx((0.0, 0.0), abs=1e-6)
     assert error((0.6, 0.8, 0.0)) == pytest.approx((1.0, 0.0), abs=1e-6)

@@ -70,8 +70,8 @@ def _fits(served: ServedMap, files: dict[str, bytes], server: str) -> bool:
     stem = map_stem(served.number)
     image, description = files[f"{stem}.pgm"], files[f"{stem}.yaml"].decode("utf-8", errors="replace")
     try:
-        area = area_of(stem, image, description)
-        if not np.allclose(area.extent_m, served.extent_m or (), rtol=0.0, atol=1e-6):
+        _, extent_m = area_of(stem, image, description)
+        if not np.allclose(extent_m, served.extent_m or (), rtol=0.0, atol=1e-6):
             return False
         parse_map(stem, image, description)
     except InputError as error:

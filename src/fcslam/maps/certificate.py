@@ -22,6 +22,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from fcslam.graph.pose_graph import PoseGraph
+from fcslam.lidar.verification import CLOSURE_SIGMA_M
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, pixels_of
 from fcslam.records import FloatArray
 
@@ -43,7 +44,7 @@ SEEN_FROM_M: Final = 0.5 * WITHIN_M
 """A pass counts for the cells up to this distance."""
 PASS_GAP_S: Final = 20.0
 """Two scans of one robot with a longer gap between them are two passes."""
-OPEN_M: Final = 0.03
+OPEN_M: Final = CLOSURE_SIGMA_M
 """A motion is open if its weakest direction has a larger standard deviation."""
 OPEN_LENGTH_M: Final = 3.0 * CELL_M
 """Shorter open stretches are not named."""

@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import yaml
@@ -105,24 +105,9 @@ def server_files(stem: str, occupancy: OccupancyMap) -> dict[str, bytes]:
     return {image: pgm_bytes(occupancy), f"{stem}.yaml": map_yaml(occupancy, image).encode()}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MapImage:
-    """The image of a map, and what its pixels mean."""
-
-    pixels: NDArray[np.uint8]
-    """Shape (H, W), row 0 at the lowest y; a view of the file's content."""
-    meaning: NDArray[np.uint8]
-    """``Occupancy`` by pixel, shape (256,)."""
-    resolution_m: float
-    origin_xy: tuple[float, float]
-
-
-class MapArea(NamedTuple):
-    """Area and resolution of a map."""
-
-    resolution_m: float
-    extent_m: tuple[float, float, float, float]
-    """Lowest x and y, highest x and y."""
+MapImage = tuple[NDArray[np.uint8], NDArray[np.uint8], float, tuple[float, float]]
+"""The image of a map, shape (H, W), row 0 at the lowest y, a view of the file's content; ``Occupancy`` by pixel, shape
+(256,); the side of a cell; and the lower left corner of cell (0, 0)."""
 
 
 def parse_image(name: str, pgm: bytes, description: str) -> MapImage:
@@ -139,7 +124,7 @@ def parse_image(name: str, pgm: bytes, description: str) -> MapImage:
     known[occupancy < free_threshold] = Occupancy.FREE
     known[occupancy > occupied_threshold] = Occupancy.OCCUPIED
     pixels = np.frombuffer(pgm, np.uint8, offset=begin).reshape(height, width)
-    return MapImage(frozen(pixels[::-1], np.uint8), frozen(known, np.uint8), resolution_m, origin_xy)
+    return frozen(pixels[::-1], np.uint8), frozen(known, np.uint8), resolution_m, origin_xy
 
 
 def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
@@ -147,22 +132,22 @@ def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
 
     Messages call the map ``name``; the image that the description names is not opened.
     """
-    image = parse_image(name, pgm, description)
-    cells = frozen(_looked_up(image.meaning, image.pixels), np.uint8)
-    return OccupancyMap(cells, image.resolution_m, image.origin_xy)
+    pixels, meaning, resolution_m, origin_xy = parse_image(name, pgm, description)
+    return OccupancyMap(frozen(_looked_up(meaning, pixels), np.uint8), resolution_m, origin_xy)
 
 
-def area_of(name: str, header: bytes, description: str) -> MapArea:
-    """Read area and resolution of a map from the first ``HEADER_BYTES`` of its image and the content of the YAML file.
+def area_of(name: str, header: bytes, description: str) -> tuple[float, tuple[float, float, float, float]]:
+    """Read the side of a cell, and the lowest x and y and highest x and y of a map, metres.
 
-    ``name`` and errors as for ``parse_map``.
+    From the first ``HEADER_BYTES`` of its image and the content of the YAML file. ``name`` and errors as for
+    ``parse_map``.
     """
     try:
         width, height, _ = _size(header)
         resolution_m, (x, y), *_ = _own_description(description)
     except ValueError as error:
         raise InputError(f"{name} is broken: {one_line(str(error))}") from error
-    return MapArea(resolution_m, (x, y, x + width * resolution_m, y + height * resolution_m))
+    return resolution_m, (x, y, x + width * resolution_m, y + height * resolution_m)
 
 
 def _size(pgm: bytes) -> tuple[int, int, int]:

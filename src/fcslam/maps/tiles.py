@@ -2,7 +2,6 @@
 
 import math
 import threading
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -34,9 +33,10 @@ def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> bytes
         FileNotFoundError: the folder has no map ``stem``.
     """
     side_m = WORLD_M / 2**zoom
-    pyramid = _pyramid(folder, stem)
-    halvings = max(math.floor(math.log2(side_m / TILE_PX / pyramid.resolution_m)), 0)
-    pixels, resolution_m, origin = pyramid.levels[halvings], pyramid.resolution_m * 2**halvings, pyramid.origin
+    with _lock:
+        levels, finest_m, origin = _pyramid(folder, stem, identity(folder))
+    halvings = max(math.floor(math.log2(side_m / TILE_PX / finest_m)), 0)
+    pixels, resolution_m = levels[halvings], finest_m * 2**halvings
     canvas = np.full((TILE_PX, TILE_PX), PIXELS[Occupancy.UNKNOWN], np.uint8)
     # first and one past the last cell in the tile, per axis (x, y)
     corner = np.array((column, row)) * side_m - origin
@@ -60,35 +60,25 @@ def tile_png(folder: Path, stem: str, zoom: int, column: int, row: int) -> bytes
     return bytes(cv2.imencode(".png", canvas[::-1])[1])
 
 
-@dataclass(frozen=True, eq=False)
-class _Pyramid:
-    """A map and coarser copies of it; a coarse tile of a large map then reads few pixels."""
-
-    levels: list[NDArray[np.uint8]]
-    """Pixels (H, W) with row 0 at the lowest y. Each level has half as many per side as the one before, their means."""
-    resolution_m: float
-    """Resolution of the first level."""
-    origin: NDArray[np.float64]
-    """Lower left corner, (2,), metres."""
-
-
 _lock = threading.Lock()
 """Many tiles are asked for at once: one request reads the map, the others wait for it."""
 
 
-def _pyramid(folder: Path, stem: str) -> _Pyramid:
-    with _lock:
-        return _read(folder, stem, identity(folder))
-
-
 @lru_cache(MAPS_KEPT)
-def _read(folder: Path, stem: str, _version: tuple[int, int]) -> _Pyramid:
+def _pyramid(
+    folder: Path, stem: str, _version: tuple[int, int]
+) -> tuple[list[NDArray[np.uint8]], float, NDArray[np.float64]]:
+    """A map and coarser copies of it, so that a coarse tile of a large map reads few pixels.
+
+    Pixels (H, W) with row 0 at the lowest y, half as many per side in each level as in the one before, their means;
+    the resolution of the first level, and the lower left corner, shape (2,), in metres.
+    """
     pgm, description = read_bytes(folder / f"{stem}.pgm", folder), read_text(folder / f"{stem}.yaml", folder)
-    image = parse_image(stem, pgm, description)
-    levels: list[NDArray[np.uint8]] = [cv2.LUT(image.pixels, pixels_of(image.meaning))]
-    for _ in range(math.floor(math.log2(max(WORLD_M / TILE_PX / image.resolution_m, 1.0)))):
+    pixels, meaning, resolution_m, origin_xy = parse_image(stem, pgm, description)
+    levels: list[NDArray[np.uint8]] = [cv2.LUT(pixels, pixels_of(meaning))]
+    for _ in range(math.floor(math.log2(max(WORLD_M / TILE_PX / resolution_m, 1.0)))):
         levels.append(_halved(levels[-1]))
-    return _Pyramid(levels, image.resolution_m, np.array(image.origin_xy))
+    return levels, resolution_m, np.array(origin_xy)
 
 
 def _halved(finer: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -77,20 +77,13 @@ def position_errors(T_truth_map: FloatArray, T_truth_base: FloatArray, T_map_bas
     return distances
 
 
-@dataclass(frozen=True, slots=True)
-class TrajectoryPair:
-    """True and estimated poses of one robot at the same stamps."""
+TrajectoryPair = tuple[FloatArray, FloatArray]
+"""True and estimated poses of one robot at the same stamps, shape (N, 3) each."""
 
-    T_truth_base: FloatArray
-    """True poses, shape (N, 3)."""
-    T_map_base: FloatArray
-    """Estimated poses, shape (N, 3)."""
 
-    def alignment(self) -> FloatArray:
-        """``T_truth_map`` (3,) from positions and headings, so that it is defined for a robot that stands still."""
-        both = (self.T_truth_base, self.T_map_base)
-        truth, estimate = (np.concatenate((T[:, :2], se2.compose(T, (1.0, 0.0, 0.0))[:, :2])) for T in both)
-        return n_point_alignment(truth, estimate)
+def _alignment(pair: TrajectoryPair) -> FloatArray:
+    """``T_truth_map`` (3,) from positions and headings, so that it is defined for a robot that stands still."""
+    return n_point_alignment(*(np.concatenate((T[:, :2], se2.compose(T, (1.0, 0.0, 0.0))[:, :2])) for T in pair))
 
 
 def placement_error(a: TrajectoryPair, b: TrajectoryPair) -> tuple[float, float]:
@@ -99,8 +92,8 @@ def placement_error(a: TrajectoryPair, b: TrajectoryPair) -> tuple[float, float]
     The trajectory of each robot alone gives an alignment of the map with the truth. The error is the difference between
     both alignments, with the translation measured at the centroid of both trajectories.
     """
-    off = se2.between(a.alignment(), b.alignment())
-    middle = np.concatenate((a.T_map_base, b.T_map_base))[:, :2].mean(axis=0)
+    off = se2.between(_alignment(a), _alignment(b))
+    middle = np.concatenate((a[1], b[1]))[:, :2].mean(axis=0)
     shift = se2.transform(off, middle[None])[0] - middle
     return float(np.hypot(*shift)), float(np.degrees(np.abs(off[2])))
 

@@ -15,7 +15,6 @@ from fcslam.metrics.grid import GridAgreement, grid_agreement
 from fcslam.metrics.relations import RelationErrors
 from fcslam.metrics.trajectory import (
     PositionErrors,
-    TrajectoryPair,
     align,
     near_pairs,
     placement_error,
@@ -139,7 +138,7 @@ def _robot_scores(
 
 
 def _joins(run: Run, known: KnownPoses) -> tuple[EvaluatedJoin, ...]:
-    tracks = [TrajectoryPair(*_poses(known, known.truth.robots == number)) for number in range(len(run.trajectories))]
+    tracks = [_poses(known, known.truth.robots == number) for number in range(len(run.trajectories))]
     robots = list(zip(run.trajectories.values(), tracks, strict=True))
     return tuple(
         EvaluatedJoin(a.robot, b.robot, *placement_error(track_a, track_b))

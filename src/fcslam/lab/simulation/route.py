@@ -10,12 +10,14 @@ from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.simulation.drivable_space import DrivableSpace
 from fcslam.lab.simulation.floorplan import FloorPlan
+from fcslam.lab.simulation.odometry import READING_RATE_HZ
 from fcslam.records import FloatArray, frozen
 
 SPEED_M_S = 0.5
 TURN_RATE_RAD_S = 0.9
 """The usual rate of a turn."""
-_RAMP_S, _RAMP_STEP_S = 0.3, 0.02
+_RAMP_S = 0.3
+_RAMP_STEP_S = 1.0 / READING_RATE_HZ
 """Time in which an eased drive changes its speed, and the time between its poses."""
 _STRETCH, _SHIFT = 0.85, 0.55
 """Length of a robot's part of the common walk, and offset of the next robot's part, as shares of the path length."""

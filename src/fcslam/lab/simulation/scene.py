@@ -18,7 +18,7 @@ CAMERA = "camera"
 LIGHTS = 5
 """Number of lights, which move to the lamps nearest to the robot; software GL supports eight at most."""
 
-_TEXTURE_M = 2.5
+_TEXTURE_M = WALL_HEIGHT_M
 """Size of one repeat of a wall or floor texture."""
 
 

@@ -180,8 +180,8 @@ def _tiling(folder: Path | None, stem: str) -> dict[str, Any]:
         return {"zoom": 0, "extent": None}
     with open_file(folder / f"{stem}.pgm", folder) as image:
         header = image.read(HEADER_BYTES)
-    area = area_of(stem, header, read_bytes(folder / f"{stem}.yaml", folder).decode(errors="replace"))
-    return {"zoom": finest_zoom(area.resolution_m), "extent": area.extent_m}
+    resolution_m, extent_m = area_of(stem, header, read_bytes(folder / f"{stem}.yaml", folder).decode(errors="replace"))
+    return {"zoom": finest_zoom(resolution_m), "extent": extent_m}
 
 
 def _archive(folder: Path) -> bytes:
