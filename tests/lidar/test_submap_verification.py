@@ -130,8 +130,8 @@ def test_free_space_is_what_beams_crossed():
     """Every cell said to be free lies inside the room, off its walls; most of the room is."""
     walls = box(-4, -3, 4, 3)
     submap, anchor = submap_along([(-1.0, 0.0, 0.0), (0.0, 0.0, 0.5), (1.0, 0.5, 1.0)], walls, 0)
-    rows, columns = np.nonzero(submap.free.cells)
-    centres = submap.free.corner + (np.column_stack((columns, rows)) + 0.5) * FREE_CELL_M
+    rows, columns = np.nonzero(submap.free)
+    centres = submap.free_corner + (np.column_stack((columns, rows)) + 0.5) * FREE_CELL_M
     inside = np.abs(se2.transform(anchor, centres))
     assert inside[:, 0].max() < 4 - 0.05
     assert inside[:, 1].max() < 3 - 0.05

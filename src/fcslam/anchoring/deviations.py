@@ -164,10 +164,10 @@ def _distance(points: FloatArray, other: Submap) -> FloatArray:
 
 def _in_free(points: FloatArray, building: Submap) -> NDArray[np.bool_]:
     free = building.free
-    column, row = np.floor((points - free.corner) / FREE_CELL_M).astype(np.int64).T
-    inside = (row >= 0) & (column >= 0) & (row < free.cells.shape[0]) & (column < free.cells.shape[1])
+    column, row = np.floor((points - building.free_corner) / FREE_CELL_M).astype(np.int64).T
+    inside = (row >= 0) & (column >= 0) & (row < free.shape[0]) & (column < free.shape[1])
     result = np.zeros(len(points), bool)
-    result[inside] = free.cells[row[inside], column[inside]]
+    result[inside] = free[row[inside], column[inside]]
     return result
 
 

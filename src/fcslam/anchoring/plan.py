@@ -9,7 +9,7 @@ import numpy as np
 
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.scan import PointScan
-from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap
+from fcslam.lidar.submap import FREE_CELL_M, Submap
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray
 
@@ -37,7 +37,7 @@ class BuildingPlan:
         field.insert(edges, _HERE)
         corner = edges.points.min(axis=0) - FREE_CELL_M
         columns, rows = np.ceil((edges.points.max(axis=0) - corner) / FREE_CELL_M).astype(np.int64) + 1
-        return Submap.of(field, FreeSpace(np.zeros((rows, columns), bool), corner))
+        return Submap.of(field, np.zeros((rows, columns), bool), corner)
 
 
 def _edges(drawing: OccupancyMap) -> PointScan:

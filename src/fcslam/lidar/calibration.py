@@ -24,7 +24,7 @@ LONGEST_S: Final = 2.0
 """Scans farther apart in time are not compared: odometry drifts."""
 FEWEST_MOTIONS: Final = 20
 """Fewer turns say nothing about times, and fewer motions nothing about the mounting."""
-FEWEST_PAIRS: Final = 4
+FEWEST_PAIRS: Final = 5
 """Fewer turns or motions say nothing about the scales: two numbers are estimated from them."""
 LARGEST_RESIDUAL_M: Final = 0.1 * LEAST_MOVE_M
 """Motions of scans and odometry that differ by more, as a standard deviation, are not a measure of each other."""

@@ -20,10 +20,10 @@ from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
 from fcslam.lidar.correlative import SearchWindow, search
 from fcslam.lidar.submap import Submap, read_submap, submap_bytes
-from fcslam.lidar.verification import SYMMETRY_M, SYMMETRY_RAD, VERIFICATION, Verification, verify
+from fcslam.lidar.verification import ALIGNMENT_SCALE_M, SYMMETRY_M, SYMMETRY_RAD, VERIFICATION, Verification, verify
 from fcslam.records import FloatArray
 
-NARROW_M = 0.8
+NARROW_M = 2.0 * ALIGNMENT_SCALE_M
 """Up to this drift allowance the prediction itself starts the alignment, and the loose gate is enough."""
 DISTANCE_PENALTY = 0.2
 ANGLE_PENALTY = 0.5 * DISTANCE_PENALTY
@@ -43,9 +43,8 @@ CLOSURE_PATH_M = 1.0
 """Path length that crossing an accepted closure counts as, metres: a closure is not exact."""
 
 CONCLUSIVE_OVERLAP = 0.4
-"""Least overlap of a closure that is accepted after a wide search without support."""
-CONCLUSIVE_SHARE, CONCLUSIVE_M = 0.3, 0.2
-"""Such a closure lies within this share of the drift allowance, plus so many metres, of its prediction."""
+"""Least overlap of a closure that is accepted after a wide search without support, nearer to its prediction than to the
+edge of the drift allowance."""
 MINIMUM_SUPPORT = 3.0
 """Sum of ``Verification.support`` that consistent pending closures need."""
 MINIMUM_SPREAD_M = MINIMUM_SUPPORT
@@ -279,7 +278,7 @@ class LoopCloser:
     @staticmethod
     def _is_conclusive(closure: LocalClosure) -> bool:
         overlap = closure.check.worse.overlap
-        near = closure.innovation_m < CONCLUSIVE_SHARE * closure.drift_m + CONCLUSIVE_M
+        near = 2.0 * closure.innovation_m < closure.drift_m
         return closure.check.strict and closure.check.informative and overlap > CONCLUSIVE_OVERLAP and near
 
 

@@ -26,7 +26,8 @@ NEAR = 2.0
 FAR = 2.0 * NEAR
 """A match agrees with odometry up to the first distance and contradicts it from the second on, in standard deviations
 of odometry's learned error."""
-LEAST_SIGMA_M, LEAST_SIGMA_RAD, SIGMA_PER_TURN = 0.025, 0.01, 0.1
+LEAST_SIGMA_M, SIGMA_PER_TURN = 0.025, 0.1
+LEAST_SIGMA_RAD = LEAST_SIGMA_M / 2.5
 """Least standard deviations of odometry that a match is judged by, metres and radians, and their growth per radian of
 turn. Matches have an error of their own, and the learned error is mostly that of small turns."""
 LEAST_STEP_M = 0.25

@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.lidar import calibration
-from fcslam.lidar.own_body import LEAST_MOVE_M, LEAST_TURN_RAD
-from fcslam.lidar.scan import GAP_PER_SPACING, beam_times, rays_of
+from fcslam.lidar.calibration import FEWEST_PAIRS
+from fcslam.lidar.own_body import moved_or_turned
+from fcslam.lidar.scan import beam_times, rays_of
 from fcslam.records import FloatArray, LaserScan
+from fcslam.sources.point_clouds import GAP_PER_SPACING
 
 LONGEST_S: Final = 2.0 * calibration.LONGEST_S
 """Scans farther apart in time are not compared: odometry drifts."""
@@ -28,8 +30,6 @@ MOST_COMPARED: Final = 50 * SCANS_WATCHED
 """Scans of a recording that are read at most: most are too near to the one before."""
 MOST_PAIRS: Final = SCANS_WATCHED
 """Pairs with a move that are compared, and as many with a turn."""
-FEWEST_PAIRS: Final = 5
-"""Fewer pairs say nothing."""
 ENOUGH_PAIRS: Final = 2 * FEWEST_PAIRS
 """Pairs with which it is certain that the stated mounting is wrong, although no other one is right."""
 FEWEST_POINTS: Final = 20
@@ -157,7 +157,7 @@ def part_agreement(scans: Iterable[LaserScan], part: Callable[[LaserScan], Laser
 
 def watch_facing(watched: list[LaserScan], scan: LaserScan) -> Sequence[LaserScan]:
     """Add the next scan of a live laser to those that tell how it faces; returns them once, when they are enough."""
-    if len(watched) == SCANS_WATCHED or (watched and not any(_moved(watched[-1], scan))):
+    if len(watched) == SCANS_WATCHED or (watched and not any(moved_or_turned(watched[-1], scan))):
         return ()
     watched.append(scan)
     return watched if len(watched) == SCANS_WATCHED else ()
@@ -200,7 +200,7 @@ def _pairs(scans: Iterable[LaserScan]) -> tuple[list[_Pair], list[_Pair]]:
         if first is None or not 0.0 <= scan.stamp - first.stamp <= LONGEST_S:
             first = scan
             continue
-        has_moved, has_turned = _moved(first, scan)
+        has_moved, has_turned = moved_or_turned(first, scan)
         if has_moved or has_turned:
             pairs = turns if has_turned else moves
             if len(pairs) < MOST_PAIRS:
@@ -209,11 +209,6 @@ def _pairs(scans: Iterable[LaserScan]) -> tuple[list[_Pair], list[_Pair]]:
         if len(moves) == len(turns) == MOST_PAIRS:
             break
     return moves, turns
-
-
-def _moved(first: LaserScan, scan: LaserScan) -> tuple[bool, bool]:
-    x, y, theta = se2.between(first.T_odom_base, scan.T_odom_base).tolist()
-    return math.hypot(x, y) > LEAST_MOVE_M, abs(theta) > LEAST_TURN_RAD
 
 
 def _agreement(pair: _Pair, facing: Facing) -> float:

@@ -22,7 +22,7 @@ from fcslam.lidar.karto import KartoTracker
 from fcslam.lidar.odometry import WHEELS, OdometryModel, OdometryTrust, odometry_error
 from fcslam.lidar.own_body import Polygon, Sectors
 from fcslam.lidar.scan import PointScan, point_scan
-from fcslam.lidar.submap import Submap, build_submap
+from fcslam.lidar.submap import LEVER_M, Submap, build_submap
 from fcslam.lidar.tracker import ScanTracker, TrackedScan, TrackingResult
 from fcslam.records import (
     Constraint,
@@ -50,7 +50,8 @@ ODOMETRY_SIGMA_RAD = 0.5 * ODOMETRY_SIGMA_M
 """Constant part of the standard deviations of odometry between two keyscans that were matched, in metres and radians;
 ``SIGMA_PER_TURN`` of the travel and the turn comes on top. It fixes what the points leave open, as along a corridor. It
 is smaller than in the tracker (``OdometryModel``): the match has shown that the wheels did not slip."""
-FLOOR_SIGMA_M, FLOOR_SIGMA_RAD, FLOOR_SHARE = 0.003, 0.001, 0.01
+FLOOR_SIGMA_M, FLOOR_SHARE = 0.003, 0.01
+FLOOR_SIGMA_RAD = FLOOR_SIGMA_M / LEVER_M
 """Least standard deviations between two keyscans, in metres and radians, and their growth per travel and turn: the
 error that more points do not reduce."""
 

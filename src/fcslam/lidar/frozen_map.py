@@ -5,19 +5,20 @@ may come from any program; nothing but its cells counts.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
 from fcslam.errors import SourceError
 from fcslam.lidar.field import TOO_MANY_WALLS, WIDEST_M, SurfelField
 from fcslam.lidar.scan import PointScan
-from fcslam.lidar.submap import FREE_CELL_M, FreeSpace, Submap
+from fcslam.lidar.submap import FREE_CELL_M, Submap
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray
 
 NORMAL_M = FREE_CELL_M
 """Width of the Gaussian over free cells whose slope is the normal of a wall."""
-FINEST_M, COARSEST_M = 0.002, 0.25
-"""Smallest and largest side of a cell."""
+COARSEST_M = 0.25
+"""Largest side of a cell."""
 
 
 def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
@@ -25,8 +26,6 @@ def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
     side = occupancy.resolution_m
     if side > COARSEST_M:
         raise SourceError(f"{name}: cells of {side:g} m are too coarse; localization needs {COARSEST_M:g} m or finer")
-    if side < FINEST_M:
-        raise SourceError(f"{name}: cells of {side:g} m are too fine; localization needs {FINEST_M:g} m or coarser")
     surface = _surface(occupancy)
     if not len(surface):
         raise SourceError(f"{name}: shows no wall beside free space; is it the right map?")
@@ -37,7 +36,7 @@ def frozen_map(occupancy: OccupancyMap, name: str) -> Submap:
     field.insert(surface, np.zeros(3))
     if field.is_full:
         raise SourceError(f"{name}: {TOO_MANY_WALLS}")
-    return Submap.of(field, _free_space(occupancy))
+    return Submap.of(field, *_free_space(occupancy))
 
 
 def _surface(occupancy: OccupancyMap) -> PointScan:
@@ -53,7 +52,7 @@ def _surface(occupancy: OccupancyMap) -> PointScan:
     return PointScan(points, normals, np.zeros(len(points), bool), np.zeros(2))
 
 
-def _free_space(occupancy: OccupancyMap) -> FreeSpace:
+def _free_space(occupancy: OccupancyMap) -> tuple[NDArray[np.bool_], FloatArray]:
     """Free cells of the size that submaps have: free where every cell of the map at its corners and middle is."""
     corner: FloatArray = np.array(occupancy.origin_xy)
     extent = occupancy.resolution_m * np.array(occupancy.cells.shape[::-1])
@@ -64,4 +63,4 @@ def _free_space(occupancy: OccupancyMap) -> FreeSpace:
         for other in (0.02, 0.5, 0.98):
             column = ((np.arange(columns) + other) * FREE_CELL_M / occupancy.resolution_m).astype(np.int64)
             cells &= occupancy.cells[np.ix_(row, column)] == Occupancy.FREE
-    return FreeSpace(cells, corner)
+    return cells, corner

@@ -30,8 +30,8 @@ LEAST_RETURNS: Final = 0.3
 """Share of the scans that have a return in each degree of the sector."""
 SAME: Final = 0.06
 """Largest deviation from the line, as a share of its distance: robots nod."""
-LEAST_STRAIGHT, LEAST_AT, MOST_BEYOND = 0.9, 0.12, 0.02
-"""Shares: of the degrees that end at the line, of the returns there, and of those farther than ``BEYOND`` of it."""
+LEAST_STRAIGHT, MOST_BEYOND = 0.9, 0.02
+"""Shares: of the degrees that end at the line, and of the returns farther than ``BEYOND`` of it."""
 BEYOND: Final = 1.0 + 2.0 * SAME
 FARTHEST_SHARE: Final = 1.0 - MOST_BEYOND
 """Share of the ranges of a degree up to its end."""
@@ -81,7 +81,7 @@ def _line_ahead(scans: Iterable[LaserScan]) -> FloorLine | None:
         away = ranges_m[:, sector] * cosines / distance_m
         away = away[np.isfinite(away)]
         at = float((np.abs(away - 1.0) < SAME).mean())
-        if at >= LEAST_AT and (away > BEYOND).mean() <= MOST_BEYOND:
+        if (away > BEYOND).mean() <= MOST_BEYOND:
             found.append((at, _line(ends_m[sector[on_line]], np.radians(sector[on_line] + 0.5))))
     if not found:
         return None

@@ -30,7 +30,7 @@ from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, VIOLATION_M, Submap, build_submap, seen_through
 from fcslam.records import FloatArray
 
-STRETCH_M: Final = 0.5
+STRETCH_M: Final = 5.0 * SPACING_M
 """Length of a stretch of wall: one independent measurement."""
 FEWEST_POINTS: Final = 0.5 * STRETCH_M / SPACING_M
 """Least points of a stretch: half of it is known."""
@@ -176,8 +176,7 @@ def _stretches(query: Submap, target: Submap, T_target_query: FloatArray) -> tup
     And which points of the map are in free space, farther than the reach of the other's walls, shape (N,).
     """
     points, normals = query.surface.points, query.surface.normals
-    field, free = target.field.arrays, target.free
-    offsets_m, states = _offsets(points, normals, T_target_query, field, free.cells, free.corner)
+    offsets_m, states = _offsets(points, normals, T_target_query, target.field.arrays, target.free, target.free_corner)
     known = states != _UNKNOWN
     if not known.any():
         return np.empty(0), 0, known

@@ -53,7 +53,7 @@ Polygon = Annotated[
 
 LEAST_MOVE_M, LEAST_TURN_RAD = 2.0 * calibration.LEAST_MOVE_M, 2.0 * calibration.LEAST_TURN_RAD
 """The robot has moved or turned by so much between two scans that are compared."""
-FEWEST_PLACES = 20
+FEWEST_PLACES = calibration.FEWEST_MOTIONS
 MOST_PLACES = 10 * FEWEST_PLACES
 SAME_M, STEADY = 0.05, 0.95
 """Largest deviation of a return of the robot from its usual range, and share of the places at which it has it."""
@@ -89,12 +89,15 @@ def scans_apart(scans: Iterable[LaserScan]) -> Iterator[LaserScan]:
     """Scans between which the robot has moved or turned, by odometry."""
     last: LaserScan | None = None
     for scan in scans:
-        if last is not None:
-            x, y, theta = se2.between(last.T_odom_base, scan.T_odom_base).tolist()
-            if not (math.hypot(x, y) > LEAST_MOVE_M or abs(theta) > LEAST_TURN_RAD):  # also without odometry
-                continue
-        last = scan
-        yield scan
+        if last is None or any(moved_or_turned(last, scan)):
+            last = scan
+            yield scan
+
+
+def moved_or_turned(first: LaserScan, scan: LaserScan) -> tuple[bool, bool]:
+    """Whether the robot has moved between two scans, and whether it has turned; neither without odometry."""
+    x, y, theta = se2.between(first.T_odom_base, scan.T_odom_base).tolist()
+    return math.hypot(x, y) > LEAST_MOVE_M, abs(theta) > LEAST_TURN_RAD
 
 
 def body_sectors(scans: Iterable[LaserScan]) -> Sectors:

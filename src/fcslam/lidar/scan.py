@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 
 from fcslam.compiled import njit
 from fcslam.records import FloatArray, Keyscan, LaserModel, Ranges, Sweep
+from fcslam.sources.point_clouds import GAP_M, GAP_PER_SPACING
 
 NORMAL_REACH = 3
 """Neighbours on each side that a normal is fitted to."""
 GAP_SPACINGS = 2.0
 """A solitary return farther than this many spacings from the one kept before is kept in any case."""
-MINIMUM_GAP_M = 0.15
-"""Neighbouring returns closer than this lie on one surface, whatever the angle between their beams."""
-GAP_PER_SPACING = 3.0
-"""Neighbouring returns closer than this many beam spacings lie on one surface."""
 LINE_TOLERANCE_M = 0.05
 """Largest standard deviation of the neighbours from the fitted line of a normal."""
 ROUNDEST = 0.1
@@ -240,7 +237,7 @@ def _is_connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-
         return False
     dx, dy = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
     nearer = min(ranges[kept[i]], ranges[kept[i + 1]])
-    limit = max(MINIMUM_GAP_M, GAP_PER_SPACING * nearer * spacing)
+    limit = max(GAP_M, GAP_PER_SPACING * nearer * spacing)
     return dx * dx + dy * dy < limit * limit
 
 

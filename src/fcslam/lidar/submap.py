@@ -15,34 +15,24 @@ from fcslam.lidar.field import CELL_M, EMPTY, TILE, FieldArrays, SurfelField, fi
 from fcslam.lidar.matching import OPPOSED
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
+from fcslam.sources.point_clouds import GAP_M
 
-FREE_CELL_M: Final = 0.1
+FREE_CELL_M: Final = 2.0 * CELL_M
 FREE_MARGIN_M: Final = 2.0 * FREE_CELL_M
 """A beam clears the cells up to this far before its end."""
 RADIUS_M: Final = 30.0
 """Surfaces and free space farther than this from the anchor are left out: distant ones are seen too sparsely."""
 SPACING_M: Final = FREE_CELL_M
 """Surfaces are compared at points this far apart."""
-SEEN_THROUGH: Final = 3
-"""A surfel counts as moving, and is dropped, if the beams of at least this many scans passed through its cell ..."""
-SEEN_THROUGH_RATIO: Final = 2
-"""... and of more than this many times the scans with a return in it: beams at a grazing angle pass walls, too."""
-ON_SURFEL_M: Final = 0.15
+SEEN_THROUGH: Final = 2
+"""A surfel counts as moving, and is dropped, if the beams of more than this many times the scans with a return in its
+cell passed through it: beams at a grazing angle pass walls, too."""
+ON_SURFEL_M: Final = GAP_M
 """A point this close to a surfel that faces the same way lies on its surface."""
 VIOLATION_M: Final = 2.0 * ON_SURFEL_M
 """A point in free space farther than this from any surfel contradicts the submap."""
 LEVER_M: Final = 3.0
 """Lever arm that scales turns to shifts: about that of the points in a submap of a room."""
-
-
-@dataclass(frozen=True, slots=True)
-class FreeSpace:
-    """Cells that beams passed through."""
-
-    cells: NDArray[np.bool_]
-    """Shape (H, W), row = y."""
-    corner: FloatArray
-    """Lower left corner of cell (0, 0), shape (2,), metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,17 +42,26 @@ class Submap:
     field: SurfelField
     surface: PointScan
     """Surfels about 0.1 m apart, without moving ones (people), which beams of other scans passed through."""
-    free: FreeSpace
+    free: NDArray[np.bool_]
+    """Cells that beams passed through, shape (H, W), row = y."""
+    free_corner: FloatArray
+    """Lower left corner of cell (0, 0), shape (2,), metres."""
     rows: NDArray[np.int16]
     """Row of each point of ``surface`` among the surfels of ``field``, shape (N,)."""
 
     @classmethod
-    def of(cls, field: SurfelField, free: FreeSpace, rows: NDArray[np.int64] | None = None) -> Self:
+    def of(
+        cls,
+        field: SurfelField,
+        free: NDArray[np.bool_],
+        free_corner: FloatArray,
+        rows: NDArray[np.int64] | None = None,
+    ) -> Self:
         """The submap of a field, which takes no more scans, with the surfels ``rows``; None: all, spaced."""
         rows = _spaced_rows(field.points) if rows is None else rows
         surface = PointScan(field.points, field.normals, field.solitary, np.zeros(2)).only(rows)
         field.compact()
-        return cls(field, surface, free, rows.astype(np.int16))
+        return cls(field, surface, free, free_corner, rows.astype(np.int16))
 
 
 def build_submap(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float = RADIUS_M) -> Submap:
@@ -77,8 +76,8 @@ def build_submap(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float 
     passes, hits, corner = _beam_counts(near, points)
     column, row = np.floor((points - corner) / FREE_CELL_M).astype(np.int64).T
     passed, hit = passes[row, column], hits[row, column]
-    moved = (passed >= SEEN_THROUGH) & (passed > SEEN_THROUGH_RATIO * hit)
-    return Submap.of(field, FreeSpace(passes > 0, corner), rows[~moved])
+    moved = passed > SEEN_THROUGH * np.maximum(hit, 1)
+    return Submap.of(field, passes > 0, corner, rows[~moved])
 
 
 def _near(scan: PointScan, T_anchor_base: FloatArray, radius_m: float) -> PointScan:
@@ -149,7 +148,7 @@ def submap_bytes(submap: Submap) -> bytes:
 
     The same bytes for the same submap, on every machine with this byte order. Nothing in them is executed.
     """
-    field, free = submap.field.arrays, submap.free
+    field = submap.field.arrays
     arrays = (
         field.corner,
         field.table,
@@ -158,9 +157,9 @@ def submap_bytes(submap: Submap) -> bytes:
         field.used,
         submap.rows,
         submap.surface.solitary,
-        _compressed(np.packbits(free.cells)),
-        np.array(free.cells.shape),
-        free.corner,
+        _compressed(np.packbits(submap.free)),
+        np.array(submap.free.shape),
+        submap.free_corner,
     )
     header = json.dumps([(array.dtype.str, array.shape) for array in arrays]).encode()
     return b"".join((header, b"\n", *(array.tobytes() for array in arrays)))
@@ -179,7 +178,7 @@ def read_submap(data: bytes) -> Submap:
     bits = np.frombuffer(zlib.decompress(free.tobytes()), np.uint8)
     cells = np.unpackbits(bits, count=math.prod(free_shape)).view(np.bool_).reshape(free_shape)
     surface = PointScan(field.points[rows], field.normals[rows], solitary, np.zeros(2))
-    return Submap(field, surface, FreeSpace(cells, free_corner), rows)
+    return Submap(field, surface, cells, free_corner, rows)
 
 
 def _compressed(array: NDArray[Any]) -> NDArray[np.uint8]:
@@ -218,8 +217,8 @@ def agreement(query: Submap, target: Submap, T_target_query: FloatArray) -> Agre
         query.surface.normals,
         T_target_query,
         target.field.arrays,
-        target.free.cells,
-        target.free.corner,
+        target.free,
+        target.free_corner,
     )
     total = max(1, len(query.surface))
     return Agreement(explained / max(1, known), violating / max(1, known), explained, known / total, tensor)

@@ -32,7 +32,7 @@ ELSEWHERE_M, ELSEWHERE_RAD = 1.0, np.radians(15.0)
 """Transforms this far apart are two."""
 PEAKS = 3
 """Best positions that are kept for each heading."""
-REFINED = 12
+REFINED = 4 * PEAKS
 """Best distinct transforms that are refined and scored exactly."""
 
 
@@ -125,13 +125,13 @@ cells well away from any surface, shape (M, 2)."""
 def _drawing(submap: Submap) -> tuple[Drawing, FloatArray]:
     """The drawing of a map, and its middle (2,) in the map's own coordinates."""
     free, points = submap.free, submap.surface.points
-    surface = np.zeros_like(free.cells)
-    column, row = np.floor((points - free.corner) / FREE_CELL_M).astype(np.int64).T
+    surface = np.zeros_like(free)
+    column, row = np.floor((points - submap.free_corner) / FREE_CELL_M).astype(np.int64).T
     surface[row, column] = True
     away = distance_transform_edt(~surface) * FREE_CELL_M > WELL_INSIDE_M
-    rows, columns = np.nonzero(free.cells & away)
+    rows, columns = np.nonzero(free & away)
     middle = points.mean(axis=0)
-    inside = (np.column_stack((columns, rows)) + 0.5) * FREE_CELL_M + free.corner - middle
+    inside = (np.column_stack((columns, rows)) + 0.5) * FREE_CELL_M + submap.free_corner - middle
     return (points - middle, inside), middle
 
 
