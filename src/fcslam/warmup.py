@@ -48,8 +48,8 @@ from fcslam.records import (
     Sweep,
     frozen,
 )
+from fcslam.robot.backend import OwnPlaces
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.robot.own_places import OwnPlaces
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.packets import encode, measure
 from fcslam.wire.quantisation import dequantise, rounded

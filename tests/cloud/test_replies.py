@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.cloud.replies import NEWS_M, NEWS_RAD, ReplyState, SessionCorrection, is_news, replies
+from fcslam.cloud.replies import NEWS_M, NEWS_RAD, SessionCorrection, is_news, replies
 from fcslam.records import Channel, Correction, DetectorFile, frozen
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate
 
@@ -13,22 +13,22 @@ OTHER = DetectorFile(Channel.CAMERA, "other-1", 1, 5, bytes(32))
 CORRECTION = Correction("a", 3, 0, frozen((1.0, 2.0, 3.1)), 0.5)
 
 
-def bodies(state, known=-1, announced=None):
-    packets = replies("a", state, known, {} if announced is None else {announced.channel: announced})
+def bodies(expected, announced=None, versions=None):
+    detectors = {} if announced is None else {announced.channel: announced}
+    packets = replies("a", expected, None, -1, detectors, versions or {})
     assert [packet.sequence for packet in packets] == list(range(len(packets)))
     assert {packet.robot for packet in packets} <= {"a"}
     return [packet.body for packet in packets]
 
 
 def test_each_epoch_is_acknowledged_up_to_its_first_gap():
-    assert bodies(ReplyState({0: 5, 1: 0, 2: 1})) == [Acknowledgement("a", 0, 4), Acknowledgement("a", 2, 0)]
-    assert bodies(ReplyState({})) == []
+    assert bodies({0: 5, 1: 0, 2: 1}) == [Acknowledgement("a", 0, 4), Acknowledgement("a", 2, 0)]
+    assert bodies({}) == []
 
 
 @pytest.mark.parametrize(("known", "sent"), [(-1, True), (2, True), (3, False), (4, False)])
 def test_a_correction_is_sent_to_a_robot_that_lacks_it(known, sent):
-    state = ReplyState({1: 1}, SessionCorrection("a", 1, 7.0, CORRECTION))
-    (_, *rest) = replies("a", state, known, {})
+    (_, *rest) = replies("a", {1: 1}, SessionCorrection("a", 1, 7.0, CORRECTION), known)
     assert [(packet.epoch, packet.time, packet.body) for packet in rest] == [(1, 7.0, CORRECTION)] * sent
 
 
@@ -43,8 +43,7 @@ def test_a_correction_is_sent_to_a_robot_that_lacks_it(known, sent):
 )
 def test_a_detector_is_announced_until_the_robot_uses_it(versions, sent):
     """A robot without a camera never needs one."""
-    state = ReplyState({0: 1}, None, versions)
-    assert bodies(state, announced=OTHER)[1:] == [DetectorUpdate("a", OTHER)] * sent
+    assert bodies({0: 1}, OTHER, versions)[1:] == [DetectorUpdate("a", OTHER)] * sent
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ class Fleet:
     def hear(self, *teammates):
         self._teammates = np.array(teammates)
 
-    def teammates(self, map_index):
+    def teammates(self, _map_index):
         return self._teammates
 
 

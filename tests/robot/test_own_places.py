@@ -8,7 +8,7 @@ import pytest
 from fcslam.geometry import se2
 from fcslam.lidar.closing import LoopCloser
 from fcslam.lidar.submap import build_submap
-from fcslam.robot.own_places import OwnPlaces
+from fcslam.robot.backend import OwnPlaces
 from tests.lidar.worlds import box, path, scan_at, shifted
 
 pytestmark = pytest.mark.slow

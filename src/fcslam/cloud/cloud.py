@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from fcslam.cloud.host import FleetHost
 from fcslam.cloud.packet_log import PacketNumber
-from fcslam.cloud.replies import ReplyState, SessionCorrection, is_news, replies
+from fcslam.cloud.replies import SessionCorrection, is_news, replies
 from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import in_session, session_name
 from fcslam.cloud.settings import CloudConfig, FleetConfig
@@ -77,8 +77,7 @@ class Cloud(FleetHost):
         robot, epoch = packet.robot, packet.epoch
         news = self._corrected(packet, session) if isinstance(packet.body, Place) else None
         known = -1 if news is None else news.correction.version - 1
-        state = ReplyState({epoch: self.log.next_sequence(session)}, news)
-        return replies(robot, state, known, {})
+        return replies(robot, {epoch: self.log.next_sequence(session)}, news, known)
 
     def _corrected(self, packet: Packet, session: str) -> SessionCorrection | None:
         estimate, last = self.fleet.correction(session), self._corrections.get(session)

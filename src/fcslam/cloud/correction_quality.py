@@ -1,7 +1,7 @@
 """How well other sessions support the pose of a session in its map: ``Correction.quality``."""
 
 from collections.abc import Collection, Iterable
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,29 +17,18 @@ HALVED_M = 10.0
 """Further travel, in metres, after which a comparison counts half: the robot may have been carried since."""
 TIE_HALVED_M = 30.0
 """Travel, in metres, after which a place with closures to other sessions counts half."""
-RECENT_M = 6.0 * TIE_HALVED_M
-"""Places before this travel are left out: each counts less than 1 / 64."""
-MOST_TIES = 10
-"""Number of places with closures after which more make no difference: 1 - 2^-10 is close to 1."""
-
-
-class _Comparison(NamedTuple):
-    """A session's newest place that was compared with those of other sessions of its map."""
-
-    last: int
-    """Number of the newest keyscan that took part."""
-    share: float
-    """Share of the surface seen by both sessions that agrees, in [0, 1]; less if a match differs or is not verified."""
 
 
 class CorrectionQuality(Kept):
     """Keeps the newest comparison of every session with another session of its map."""
 
-    KEPT: ClassVar = {"_newest": dict[str, _Comparison]}
+    KEPT: ClassVar = {"_newest": dict[str, tuple[int, float]]}
 
     def __init__(self, graph: JointGraph) -> None:
         self._graph = graph
-        self._newest: dict[str, _Comparison] = {}
+        self._newest: dict[str, tuple[int, float]] = {}
+        """By session: number of the newest keyscan that took part, and the share of the surface seen by both sessions
+        that agrees, in [0, 1]; less if a match differs or is not verified."""
 
     def update(self, place: Place, matches: Iterable[PlaceMatch], robots: Collection[str]) -> None:
         """Take the matches of a new place into account; ``robots`` share its map, whose estimate is current."""
@@ -51,21 +40,18 @@ class CorrectionQuality(Kept):
                     compared.setdefault(keyscan, []).append(match)
         for (session, last), found in compared.items():
             newest = self._newest.get(session)
-            if newest is None or newest.last <= last:
-                self._newest[session] = _Comparison(last, self._share(found))
+            if newest is None or newest[0] <= last:
+                self._newest[session] = last, self._share(found)
 
     def of(self, session: str, robots: Collection[str], closures: ClosureLog) -> float:
         """In [0, 1], as in ``Correction``; ``robots`` share the session's map."""
         newest = self._newest.get(session)
         if len(robots) == 1 or newest is None:
             return 0.0
-        since_m = self._graph.travel_since(session)
-        tied = 0.0
-        for number in reversed(closures.tied(session)):
-            if tied < MOST_TIES and since_m[number] < RECENT_M:
-                tied += 0.5 ** (since_m[number] / TIE_HALVED_M)
-        weight = 0.5 ** (max(since_m[newest.last] - FRESH_M, 0.0) / HALVED_M)
-        return newest.share * float(weight * (1.0 - 0.5**tied))
+        since_m, (last, share) = self._graph.travel_since(session), newest
+        tied = np.sum(0.5 ** (since_m[closures.tied(session)] / TIE_HALVED_M))
+        weight = 0.5 ** (max(since_m[last] - FRESH_M, 0.0) / HALVED_M)
+        return share * float(weight * (1.0 - 0.5**tied))
 
     def _share(self, matches: list[PlaceMatch]) -> float:
         """The best share of the matches that fit, times the part of them that fit: half if it is not verified.

@@ -13,7 +13,7 @@ import numpy as np
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.edits import is_cut, is_removed, stamps_of
 from fcslam.cloud.joining import CONSISTENCY, decide_join, reevaluate
-from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD, JointGraph
+from fcslam.cloud.joint_graph import SOLVED_SHARE, SURPRISE_M, SURPRISE_RAD, JointGraph
 from fcslam.cloud.map_comparison import MapComparison
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.session_store import SessionStore
@@ -47,7 +47,7 @@ the same evidence would be weighed again at every place."""
 
 REFINED_KEYSCANS = 15
 """Scans before and after each end of a closure by hand whose walls refine it: a few metres of path."""
-DECIDED_GROWTH = 1.05
+DECIDED_GROWTH = 1.0 + SOLVED_SHARE
 """Sessions whose evidence fell short are decided again when it has grown by this factor, or in a re-evaluation. A
 decision tests every pair of closures: at each place, it would take longer than all else where robots meet for hours."""
 DECIDED_EACH_TIME = 100

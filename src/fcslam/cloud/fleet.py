@@ -6,7 +6,7 @@ evidence may revoke a join. ``finalize`` depends on the set of packets only, not
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from fcslam.cloud.claims import LONGEST_CLOSURE_M, check_constraint, check_submap, with_least_noise
 from fcslam.cloud.closure_log import ClosureEntry
@@ -45,11 +45,6 @@ from fcslam.storage.state_file import State
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 
 
-class _Replayed(NamedTuple):
-    order: list[PacketNumber]
-    state: State
-
-
 class Fleet:
     """Applies packets; place recognition and decisions about closures have classes of their own."""
 
@@ -78,8 +73,8 @@ class Fleet:
         self._quality = CorrectionQuality(self._graph)
         self._needs_replay = False
         """Whether something besides the packets changed the graph: an edit."""
-        self._replayed: _Replayed | None = None
-        """The replay of the last result, which the next one goes on from."""
+        self._replayed: tuple[list[PacketNumber], State] | None = None
+        """Order and state of the replay of the last result, which the next one goes on from."""
 
     def apply(self, packet: Packet) -> None:
         """Let one packet take effect: figure 1 of the paper, cloud side.
@@ -221,15 +216,15 @@ class Fleet:
         changes, done = self._decisions.changes, 0
         order = [number for number in log.canonical(arrived) if not is_removed(number.session, changes)]
         replayed, self._replayed = self._replayed, None
-        if replayed is not None and order[: len(replayed.order)] == replayed.order:
-            done = len(replayed.order)
-            replay = Fleet.restored(self._config, self._seed, replayed.state, read, self._verify_pairs, changes)
+        if replayed is not None and order[: len(replayed[0])] == replayed[0]:
+            done = len(replayed[0])
+            replay = Fleet.restored(self._config, self._seed, replayed[1], read, self._verify_pairs, changes)
         else:
             replay = Fleet(self._config, self._seed, self._verify_pairs)
             replay.edit(changes)
         for number in order[done:]:
             replay.apply(read(number))
-        self._replayed = _Replayed(order, replay.state())
+        self._replayed = order, replay.state()
         return replay.conclude()
 
     def correction(self, session: str) -> Correction | None:

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
 from fcslam.graph.cluster import relative_frame
@@ -37,13 +38,12 @@ LOCAL_M = 8.0
 LOCAL_RADIUS_M = 14.0
 """Radius of a local map."""
 FEWEST_LOCAL_KEYSCANS, MOST_LOCAL_KEYSCANS = 4, 30
-PLACES_APART_M = 4.0
+PLACES_APART_M = 0.5 * LOCAL_M
+"""Distance of local maps, which overlap by half."""
 MOST_LOCAL_MAPS = 16
 """Most places at which local maps are compared; of more, evenly spaced ones."""
 FARTHEST_M = 20.0
 """A closure gives the transform between two maps up to this far along the path: beyond, drift counts."""
-DRIFT_M, DRIFT_RAD = 0.5, 0.1
-"""Local maps are aligned within these: farther off, another wall is the nearest one."""
 RIVALS = 2
 """Transforms elsewhere at which local maps are compared: those with the best scores."""
 _NONE = KeyscanId("", -1)
@@ -218,7 +218,8 @@ class _LocalMaps:
             T_i_j = _between(poses_a[i], T_a_b[j], poses_b[j])
             aligned = align_map(map_a.submap, map_b.submap, T_i_j).T_a_b
             off = se2.between(T_i_j, aligned)
-            is_near = np.hypot(off[0], off[1]) < DRIFT_M and abs(off[2]) < DRIFT_RAD
+            # Farther off, another wall is the nearest one.
+            is_near = np.hypot(off[0], off[1]) < SURPRISE_M and abs(off[2]) < SURPRISE_RAD
             agreements.append(compare(map_a, map_b, aligned if is_near else T_i_j, noise))
         return total(agreements)
 

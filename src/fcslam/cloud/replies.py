@@ -5,6 +5,7 @@ The same replies leave the service (``service.intake``) and the cloud within one
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -27,36 +28,34 @@ class SessionCorrection:
     correction: Correction
 
 
-@dataclass(frozen=True, slots=True)
-class ReplyState:
-    """The state on which the replies to one robot depend."""
-
-    next_sequences: Mapping[int, int]
-    """By epoch, ascending: number of the first packet that did not arrive; the last epoch is the current one."""
-    correction: SessionCorrection | None = None
-    """Newest correction of the current epoch."""
-    detector_versions: Mapping[Channel, str] | None = None
-    """The robot's detectors, by its last hello; None before it."""
-
-
 def replies(
-    robot: str, state: ReplyState, known_correction: int, announced: Mapping[Channel, DetectorFile]
+    robot: str,
+    next_sequences: Mapping[int, int],
+    newest: SessionCorrection | None,
+    known_correction: int,
+    announced: Mapping[Channel, DetectorFile] = MappingProxyType({}),
+    versions: Mapping[Channel, str] = MappingProxyType({}),
 ) -> list[Packet]:
     """The packets that go back to a robot, numbered from 0.
 
-    ``known_correction`` is the version of the newest correction that the robot has, -1: none. ``announced`` are the
-    detectors that robots are to use.
+    Args:
+        robot: its name.
+        next_sequences: by epoch, ascending: number of the first packet that did not arrive; the last epoch is the
+            current one.
+        newest: the newest correction of the current epoch.
+        known_correction: version of the newest correction that the robot has; -1: none.
+        announced: the detectors that robots are to use.
+        versions: the robot's detectors, by its last hello.
     """
-    if not state.next_sequences:
+    if not next_sequences:
         return []
-    expected = state.next_sequences.items()
+    expected = next_sequences.items()
     bodies: list[tuple[int, float, Body]] = [(k, 0.0, Acknowledgement(robot, k, n - 1)) for k, n in expected if n > 0]
-    if (news := state.correction) and news.correction.version > known_correction:
-        bodies.append((news.epoch, news.time, news.correction))
-    versions = state.detector_versions or {}
+    if newest is not None and newest.correction.version > known_correction:
+        bodies.append((newest.epoch, newest.time, newest.correction))
     for channel, file in announced.items():
         if versions.get(channel, file.version) != file.version:  # a robot without the channel needs no detector
-            bodies.append((max(state.next_sequences), 0.0, DetectorUpdate(robot, file)))
+            bodies.append((max(next_sequences), 0.0, DetectorUpdate(robot, file)))
     return [Packet(robot, epoch, number, time_s, body) for number, (epoch, time_s, body) in enumerate(bodies)]
 
 

@@ -11,8 +11,8 @@ closure is more precise: the matched point is the position of its keyscan j, and
 Where words alone decide, no ``T_i_j`` is measured; it is zero, and the two positions are one as in the paper.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,24 +27,8 @@ EQUAL_M = 0.5
 """Largest difference of the distances of two points in both maps. If words alone decide, the robots stood apart."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Match:
-    """One point seen by two robots, shape (2,) in the own map of each."""
-
-    entry: ClosureEntry
-    robots: tuple[str, str]
-    """a and b, a the one that started first."""
-    xy_a: FloatArray
-    xy_b: FloatArray
-
-    def is_valid_with(self, other: "_Match") -> bool:
-        """Whether one rigid motion can lay both points of one map on those of the other and they give its direction."""
-        apart_a = float(np.hypot(*(self.xy_a - other.xy_a)))
-        apart_b = float(np.hypot(*(self.xy_b - other.xy_b)))
-        return min(apart_a, apart_b) >= DIRECTION_M and abs(apart_a - apart_b) <= EQUAL_M
-
-
-_Links = Mapping[tuple[str, str], tuple[_Match, _Match]]
+_Match = tuple[ClosureEntry, FloatArray]
+"""A closure, and one point that its two robots a and b saw, in the own map of each, shape (2, 2); a started first."""
 
 
 def fuse_rigidly(closures: Iterable[ClosureEntry], T_local_base: Mapping[str, FloatArray]) -> Fusion:
@@ -54,47 +38,50 @@ def fuse_rigidly(closures: Iterable[ClosureEntry], T_local_base: Mapping[str, Fl
     and no veto excludes is a match, including closures that the joint map predicted. The closures that align two maps
     are accepted, the others stay verified; closures within robots keep their status.
     """
-    order, entries = list(T_local_base), list(closures)
+    entries = list(closures)
     between = [entry for entry in entries if entry.is_between and not entry.vetoed]
     valid = [entry for entry in between if entry.closure.status is not ClosureStatus.CANDIDATE]
-    links = _links([_match(entry, T_local_base, order) for entry in valid])
-    maps, frames = [[robot] for robot in order], {robot: np.zeros(3) for robot in order}
+    maps, frames = [[robot] for robot in T_local_base], {robot: np.zeros(3) for robot in T_local_base}
     used: dict[ClosureEntry, Reason] = {}
-    for robots, members in links.items():
+    for robots, members in _links(valid, T_local_base).items():
         try:
-            T_a_b = two_point_alignment([match.xy_a for match in members], [match.xy_b for match in members])
+            T_a_b = two_point_alignment([points[0] for _, points in members], [points[1] for _, points in members])
         except ValueError:  # a robot claims to be so far away that its two points are one to a computer
             continue
         if np.isfinite(T_a_b).all() and _join(robots, T_a_b, maps, frames):
-            used |= {match.entry: Reason(ReasonCode.MATCHED_POINT, len(members)) for match in members}
+            used |= {entry: Reason(ReasonCode.MATCHED_POINT, len(members)) for entry, _ in members}
     T_map_base: dict[str, FloatArray] = {
         robot: frozen(se2.compose(frames[robot], poses)) for robot, poses in T_local_base.items()
     }
     return Fusion(maps, T_map_base, T_local_base, tuple(_closure(entry, used) for entry in entries))
 
 
-def _match(entry: ClosureEntry, T_local_base: Mapping[str, FloatArray], order: Sequence[str]) -> _Match:
-    i, j = entry.closure.i, entry.closure.j
-    xy_i = se2.compose(T_local_base[i.robot][i.number], entry.closure.T_i_j)[:2]
-    xy_j = T_local_base[j.robot][j.number][:2]
-    if order.index(i.robot) < order.index(j.robot):
-        return _Match(entry, (i.robot, j.robot), xy_i, xy_j)
-    return _Match(entry, (j.robot, i.robot), xy_j, xy_i)
-
-
-def _links(matches: Sequence[_Match]) -> _Links:
+def _links(
+    entries: Iterable[ClosureEntry], T_local_base: Mapping[str, FloatArray]
+) -> dict[tuple[str, str], tuple[_Match, _Match]]:
     """The two matches that align the maps of each pair of robots; pairs with the most similar ones come first."""
+    order = list(T_local_base)
     known: dict[tuple[str, str], list[_Match]] = {}
     two: dict[tuple[str, str], tuple[_Match, _Match]] = {}
-    for match in sorted(matches, key=lambda match: -match.entry.closure.similarity):
-        if match.robots in two:
-            continue
-        earlier = known.setdefault(match.robots, [])
-        partner = next((other for other in earlier if match.is_valid_with(other)), None)
-        if partner is not None:
-            two[match.robots] = partner, match
-        earlier.append(match)
+    for entry in sorted(entries, key=lambda entry: -entry.closure.similarity):
+        i, j = entry.closure.i, entry.closure.j
+        T_own_i = T_local_base[i.robot][i.number]
+        points = np.stack((se2.compose(T_own_i, entry.closure.T_i_j)[:2], T_local_base[j.robot][j.number][:2]))
+        robots = i.robot, j.robot
+        if order.index(i.robot) > order.index(j.robot):
+            robots, points = robots[::-1], points[::-1]
+        earlier = known.setdefault(robots, [])
+        partner = next((other for other in earlier if _are_valid(points, other[1])), None)
+        if partner is not None and robots not in two:
+            two[robots] = partner, (entry, points)
+        earlier.append((entry, points))
     return two
+
+
+def _are_valid(points: FloatArray, others: FloatArray) -> bool:
+    """Whether one rigid motion can lay both points of one map on those of the other and they give its direction."""
+    apart_a, apart_b = np.hypot(*(points - others).T).tolist()
+    return bool(min(apart_a, apart_b) >= DIRECTION_M and abs(apart_a - apart_b) <= EQUAL_M)
 
 
 def _join(robots: tuple[str, str], T_a_b: FloatArray, maps: list[list[str]], frames: dict[str, FloatArray]) -> bool:

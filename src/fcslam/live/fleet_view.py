@@ -17,18 +17,16 @@ from fcslam.maps.joint_tiles import LARGEST_ANSWER, TiledMap, decode_batch
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.sender import retry_delay_s
+from fcslam.robot.uplink import STOP_TIMEOUT_S
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.fleet_replies import FleetReply, MapFrontiers, QualityReply
 
 POLL_S: Final = 0.5
 """Time between two looks at the fleet."""
-FRONTIERS_S: Final = 5.0
-"""Time between two looks at the frontiers."""
-QUALITY_S: Final = 10.0
-"""Time between two looks at how good the map is."""
+ADVICE_S: Final = 5.0
+"""Time between two looks at the frontiers and at how good the map is."""
 DOWNLINK_KB_PER_S: Final = 15.0
 """Limit of the tiles, kB per second, without a budget."""
-STOP_TIMEOUT_S: Final = 2.0
 MOST_NEWS: Final = 1000
 """Changes of the fleet that are kept."""
 
@@ -83,7 +81,7 @@ class FleetView:
         """Where the robot's map can be explored further, and who shall go where."""
         self.quality: tuple[QualityReply, ...] = ()
         """How good the robot's map is; empty before the cloud has computed its certificate."""
-        self._frontiers_s = self._quality_s = -np.inf
+        self._advised_s = -np.inf
         self.trouble: str | None = None
         """Why the cloud cannot be followed; None if it can."""
         self._failures = 0
@@ -160,12 +158,9 @@ class FleetView:
         self._tell(before, self._in_map())
         if is_complete:  # the poses came before the tiles, so the tiles hold at least this keyscan
             self.drawn_s = stamp
-        if self.clock() - self._frontiers_s >= FRONTIERS_S:
-            self._frontiers_s = self.clock()
-            self.frontiers = client.frontiers(self._robot)
-        if self.clock() - self._quality_s >= (QUALITY_S if self.quality else FRONTIERS_S):
-            self._quality_s = self.clock()
-            self.quality = client.quality(self._robot)
+        if self.clock() - self._advised_s >= ADVICE_S:
+            self._advised_s = self.clock()
+            self.frontiers, self.quality = client.frontiers(self._robot), client.quality(self._robot)
 
     def _run(self) -> None:
         wait_s = 0.0

@@ -13,9 +13,6 @@ from fcslam.records import CameraImage, CameraModel, FloatArray, LaserModel, Las
 from fcslam.runs import check_names
 from fcslam.sources.gate import MAX_STEP_BACK_S
 
-JPEG_QUALITY = 95
-"""JPEG quality of images that are given as arrays."""
-
 Lasers = LaserModel | Mapping[str, LaserModel]
 
 
@@ -99,7 +96,7 @@ def checked_image(image: ArrayLike, stamp: float, T_odom_base: FloatArray | None
             f"image: shape {pixels.shape} of {pixels.dtype}, but the camera gives {size} or {(*size, 3)} of uint8"
         )
     grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    _, encoded = cv2.imencode(".jpg", grey, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
+    _, encoded = cv2.imencode(".jpg", grey)
     return CameraImage(stamp, encoded.tobytes(), camera, T_odom_base)
 
 

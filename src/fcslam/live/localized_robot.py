@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,13 +34,6 @@ from fcslam.wire.messages import Body, Packet
 
 _NOWHERE = MapEstimate(frozen(np.full(3, np.nan)), frozen(np.full((3, 3), np.nan)), 0.0)
 """The estimate of a robot that is not localized."""
-
-
-class _Found(NamedTuple):
-    estimate: MapEstimate | None
-    """None: the robot was not localized."""
-    fixes: int
-    losses: int
 
 
 class LocalizedRobot(LiveTracker):
@@ -94,8 +87,11 @@ class LocalizedRobot(LiveTracker):
         initial = None if initial_pose is None else pose_in_map("initial_pose", initial_pose, self._map)
         self._drive = LocalizedDrive()
         self._was_localized = False
-        self._found, self._found_session = _Found(None, 0, 0), 0
-        """The newest result of the worker, and its session: ``odom`` is another frame in each."""
+        self._found: MapEstimate | None = None
+        """The newest result of the worker; None: the robot was not localized."""
+        self._found_session = 0
+        """Its session: ``odom`` is another frame in each."""
+        self._fixes = self._losses = 0
         self._keyscans = self._submitted_sessions = 0
         robot = self._config.robot
         with ExitStack() as stack:
@@ -135,7 +131,7 @@ class LocalizedRobot(LiveTracker):
             scans=self._scans,
             keyscans=self._keyscans,
             map_index=0,
-            times_lost=self._found.losses,
+            times_lost=self._losses,
             quality=0.0 if estimate is None else estimate.quality,
             notices=tuple(filter(None, (broken, jumps))),
             is_localized=estimate is not None,
@@ -177,12 +173,12 @@ class LocalizedRobot(LiveTracker):
         """
         prepare_output(Path(folder), force)
         with self._lock:
-            run = self._drive.run(self.name, self._map, self._config, self._found.fixes, self._found.losses)
+            run = self._drive.run(self.name, self._map, self._config, self._fixes, self._losses)
         run.save(folder, force)
         return run
 
     def _estimate(self) -> MapEstimate | None:
-        return self._found.estimate if self._found_session == self._session else None
+        return self._found if self._found_session == self._session else None
 
     def _submit(self, input: BackendInput) -> "Future[list[Body]]":
         self._keyscans += isinstance(input, NewKeyscan)
@@ -193,13 +189,14 @@ class LocalizedRobot(LiveTracker):
         handled: Future[list[Body]] = Future()
         session = self._submitted_sessions
 
-        def take(done: "Future[_Found]") -> None:
+        def take(done: "Future[tuple[MapEstimate | None, int, int]]") -> None:
             error = FcslamError("the robot was closed") if done.cancelled() else done.exception()
             if error is None:
-                self._found, self._found_session = done.result(), session
+                self._found, self._fixes, self._losses = done.result()
+                self._found_session = session
                 handled.set_result([])
             else:  # nobody follows the robot any more
-                self._found = self._found._replace(estimate=None)
+                self._found = None
                 handled.set_exception(error)
 
         self._localizer.call(_after, method, argument).add_done_callback(take)
@@ -240,6 +237,9 @@ def _localizer(occupancy: OccupancyMap, initial: FloatArray | None) -> MapLocali
     return MapLocalizer(frozen_map(occupancy, "the map"), initial)
 
 
-def _after(localizer: MapLocalizer, method: Callable[..., object], argument: object) -> _Found:
+def _after(
+    localizer: MapLocalizer, method: Callable[..., object], argument: object
+) -> tuple[MapEstimate | None, int, int]:
+    """Estimate, fixes and losses after a call."""
     method(localizer, argument)
-    return _Found(localizer.estimate, localizer.fixes, localizer.losses)
+    return localizer.estimate, localizer.fixes, localizer.losses

@@ -46,7 +46,7 @@ from fcslam.robot.backend_runner import in_worker
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.robot.keyframe_folder import KEYFRAMES
 from fcslam.robot.outbox import Outbox
-from fcslam.robot.sender import CONNECTING
+from fcslam.robot.sender import CONNECTING, SEND_INTERVAL_S
 from fcslam.robot.uplink import Uplink
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.warmup import warm_up_tracking
@@ -64,9 +64,6 @@ POLL_INTERVAL_S = 0.1
 LARGEST_BACKLOG = 200
 """Largest number of inputs that wait for the back end or the disk, or of blocks of packets that wait for the map, while
 a recording is played; a robot in real time never has as many."""
-
-BLOCK_S = 1.0
-"""Length of the blocks in which packets go to the robot's own map, seconds."""
 
 LARGEST_OUTBOX_BYTES = 256_000_000
 """Limit of the packets that wait for the server; above three quarters, places are left out."""
@@ -496,7 +493,7 @@ class Robot(LiveTracker):
                 self._news += 1
                 self._event(EventKind.FLEET, line)
         if self._own is not None:
-            self._own.hand_over(self._newest_s - BLOCK_S)
+            self._own.hand_over(self._newest_s - SEND_INTERVAL_S)
         broken = self._frontend.packets.failure, None if self._own is None else self._own.failure
         for failure in filter(None, broken):
             self._tell_failure(f"no loop closures from now on, as the back end failed: {failure}")

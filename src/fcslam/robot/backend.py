@@ -4,25 +4,33 @@ It builds submaps, closes loops, solves the pose graph and describes places. Its
 their order, so it gives the same records wherever and whenever it runs (``fcslam.robot.backend_runner``).
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum, auto
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
 from fcslam.config import Settings
 from fcslam.errors import FeatureError
-from fcslam.features.birdseye import DETECTOR_VERSION
+from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeFeatures
+from fcslam.features.birdseye import describe as describe_surface
+from fcslam.features.codes import mutual_matches
 from fcslam.geometry import se2
 from fcslam.lidar.backend import FinishedSubmap, LidarBackend
 from fcslam.lidar.frontend import LidarConfig, MappedKeyscan, ScanPose
+from fcslam.places.index import PlaceIndex
+from fcslam.places.motions import LARGEST_HAMMING, LEAST_INLIERS, rigid_hypotheses
+from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import (
     PLACE_CHANNELS,
     CameraImage,
     Channel,
+    Codes,
     DetectorFile,
     FloatArray,
     KeyscanFix,
@@ -34,7 +42,6 @@ from fcslam.records import (
     TagSighting,
 )
 from fcslam.robot.keyframe_folder import KeyframeFolder, KeyframeImage
-from fcslam.robot.own_places import OwnPlaces
 from fcslam.robot.tag_detection import TagDetector, TagsConfig
 from fcslam.robot.views import ViewExtractor, ViewsConfig
 from fcslam.wire.messages import Body, Hello
@@ -101,8 +108,12 @@ class Task(Enum):
     """The next keyscan begins another session."""
 
 
-PLACED_AFTER, PLACED_AFTER_SHARE = 20, 0.1
-"""Keyframes after which the poses of all are written again, and as a share of those that there are."""
+VOCABULARY = VocabularyConfig()
+"""Vocabulary of the places of one robot."""
+READY = 64
+"""Places whose descriptors are kept ready: successive submaps are compared with the same ones."""
+PLACED_AFTER = 20
+"""Keyframes after which the poses of all keyscans are written again."""
 
 BackendInput = NewKeyscan | NewImage | KeyscanFix | NewDetector | Task
 
@@ -120,8 +131,8 @@ class RobotBackend:
         self._config = config
         self._folder = None if keyframes is None else KeyframeFolder(keyframes)
         self._view_extractor = ViewExtractor(robot, config.views, self._folder)
-        self._unplaced = self._placed = 0
-        """Keyframes since their poses were written last, and all until then."""
+        self._unplaced = 0
+        """Keyframes since their poses were written last."""
         self._session = _Session(robot, 0, self._view_extractor, config)
 
     @property
@@ -141,7 +152,9 @@ class RobotBackend:
                 return self._session.add(input)
             case NewImage():
                 if Channel.CAMERA in self._config.channels and self._session.describe(input):
-                    self._place_sometimes()
+                    self._unplaced += 1
+                    if self._unplaced >= PLACED_AFTER:
+                        self._place()
                 return list(self._session.find_tags(input))
             case KeyscanFix():
                 return [input]
@@ -160,15 +173,10 @@ class RobotBackend:
                 return rest
         return []
 
-    def _place_sometimes(self) -> None:
-        self._unplaced += 1
-        if self._unplaced >= max(PLACED_AFTER, PLACED_AFTER_SHARE * self._placed):
-            self._place()
-
     def _place(self) -> None:
         if self._folder is not None:
             self._folder.place(self._session.keyscan_poses())
-        self._placed, self._unplaced = self._placed + self._unplaced, 0
+        self._unplaced = 0
 
     def _set_detector(self, file: DetectorFile, path: Path) -> None:
         if file.channel is not Channel.CAMERA or file.channel not in self._config.channels:
@@ -277,6 +285,54 @@ class _Session:
         known = {Channel.LIDAR: DETECTOR_VERSION, Channel.CAMERA: self._view_extractor.detector_version}
         versions = {channel: version for channel in self._config.channels if (version := known[channel]) is not None}
         return Hello(self._robot, self.epoch, self._lasers, versions)
+
+
+class OwnPlaces:
+    """The LiDAR places of one session (``lidar.closing.PlaceRecognizer``), with a vocabulary of their own.
+
+    So the robot recognises where it was before, however far its estimate has drifted.
+    """
+
+    def __init__(self, vocabulary: VocabularyConfig = VOCABULARY) -> None:
+        self._keypoints_m: dict[int, NDArray[np.float32]] = {}
+        self._index: PlaceIndex[int] = PlaceIndex(vocabulary, np.random.default_rng(0))
+        self._descriptors = lru_cache(READY)(self._index.descriptors)
+        """Those of a place in the index, which holds each descriptor once."""
+        self._waiting: dict[int, Codes] = {}
+        """Descriptors of the places that the index lacks: a robot whose loops are short never asks it."""
+
+    def store(self, keyscan: int, surface: FloatArray) -> None:
+        """Describe and store a submap by the points of its surfaces, shape (N, 2), metres in its anchor's base."""
+        features = describe_surface(surface)
+        self._keypoints_m[keyscan], self._waiting[keyscan] = features.keypoints_m, features.descriptors
+
+    def features(self, keyscan: int) -> BirdseyeFeatures:
+        """The description of a stored submap."""
+        waiting = self._waiting.get(keyscan)
+        return BirdseyeFeatures(self._keypoints_m[keyscan], self._descriptors(keyscan) if waiting is None else waiting)
+
+    def most_similar(self, keyscan: int, among: Collection[int], most: int) -> list[int]:
+        """At most ``most`` of these stored submaps that look like a stored one, the most similar first."""
+        for stored, descriptors in self._waiting.items():
+            self._index.add(stored, descriptors)
+        self._waiting.clear()
+        result = self._index.compare(self._descriptors(keyscan))
+        return [found.id for found in result.best(most, lambda place: place in among)]
+
+    def forget(self, keyscan: int) -> None:
+        """Forget a stored submap."""
+        del self._keypoints_m[keyscan]
+        if keyscan in self._index:
+            self._index.forget(keyscan)
+        else:
+            del self._waiting[keyscan]
+
+    def motions(self, a: int, b: int) -> list[FloatArray]:
+        """Motions ``T_a_b``, shape (3,), that enough keypoints of two stored submaps support, the best first."""
+        of_a, of_b = self.features(a), self.features(b)
+        matches = mutual_matches(of_a.descriptors, of_b.descriptors, LARGEST_HAMMING)
+        proposed = rigid_hypotheses(of_a.keypoints_m, of_b.keypoints_m, matches)
+        return [T_a_b for T_a_b, inliers in proposed if len(inliers) >= LEAST_INLIERS]
 
 
 def essential(input: NewKeyscan) -> list[Body]:

@@ -52,10 +52,9 @@ GROSS_SCALE: Final = 0.25
 """Scales that differ by more are no matter of precision."""
 LEAST_SHARE: Final = 0.25
 """Smaller differences from what the bag says are not corrected: matching holds back short turns by up to 20 %."""
-SHORT_SHARE: Final = 0.2
-"""Beams that are said to take a smaller share of this time may take longer."""
-AT_ONCE_SHARE: Final = 0.15
-"""Beams that take a smaller share of the time between scans are measured at once."""
+AT_ONCE_SHARE: Final = 0.2
+"""Beams that take a smaller share of the time between scans are measured at once. If they are only said to take so
+little, they may take longer."""
 WHOLE_SHARE: Final = 0.05
 """A scanner that spins without a pause measures all the time between scans."""
 FLOOR_HALF_DEG: Final = 75
@@ -277,7 +276,7 @@ def _times(stated: Sweep | None, assumed_s: float) -> tuple[float, float]:
 
     Some drivers state times that are far too short, which say as little as none.
     """
-    is_said = stated is not None and abs(stated.last_s - stated.first_s) > SHORT_SHARE * assumed_s
+    is_said = stated is not None and abs(stated.last_s - stated.first_s) > AT_ONCE_SHARE * assumed_s
     return (stated.first_s, stated.last_s) if stated is not None and is_said else (0.0, assumed_s)
 
 

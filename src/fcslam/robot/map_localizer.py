@@ -49,7 +49,7 @@ CHECKED_M = 5.0
 """Travel, in metres, whose walls are compared with the map."""
 DOUBTED = 0.80
 """With a smaller share of the walls in the map, the pose is compared with the best one elsewhere."""
-LOST_IN_FREE_SPACE = 0.20
+LOST_IN_FREE_SPACE = 2.0 * MOST_IN_FREE_SPACE
 """A robot that is lost sees a larger share of its walls in free space of the map. It is less than that of keyscans
 (``LOST_VIOLATION``): a finished map has no error of the robot's newest poses."""
 LARGEST_UNSEEN_M = 20.0

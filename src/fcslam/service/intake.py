@@ -8,7 +8,7 @@ from typing import NamedTuple
 from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.edits import in_force, is_removed
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
-from fcslam.cloud.replies import ReplyState, replies
+from fcslam.cloud.replies import replies
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
 from fcslam.errors import FcslamError, InputError, PacketError
 from fcslam.mission.mission_store import MissionStore, StoredPacket
@@ -248,12 +248,11 @@ class Intake:
     def _replies(self, robot: str, epochs: Sequence[int], known_correction: int) -> bytes:
         announced, newest = self._announced(), epochs[-1] if epochs else None
         hello = self._store.newest_hello(robot, newest) if announced and newest is not None else None
-        state = ReplyState(
-            {epoch: self._log.next_sequence(session_name(robot, epoch)) for epoch in epochs},
-            None if newest is None else self._store.correction(robot, newest),
-            None if hello is None else hello.detector_versions,
-        )
-        return write_batch(encode(reply) for reply in replies(robot, state, known_correction, announced))
+        expected = {epoch: self._log.next_sequence(session_name(robot, epoch)) for epoch in epochs}
+        correction = None if newest is None else self._store.correction(robot, newest)
+        versions = {} if hello is None else hello.detector_versions
+        packets = replies(robot, expected, correction, known_correction, announced, versions)
+        return write_batch(map(encode, packets))
 
 
 def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], RefusedPacketError | None]:
