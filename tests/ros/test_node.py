@@ -10,7 +10,6 @@ import pytest
 import fcslam
 from fcslam.errors import InputError
 from fcslam.geometry import se2
-from fcslam.live.fleet_view import Teammate
 from fcslam.live.records import Wiring
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, parse_map
 from fcslam.ros.node import EMPTY, FINISH, INITIAL_POSE, SAVE_MAP, STRING, RobotNode, await_sensors
@@ -20,7 +19,7 @@ from fcslam.ros.sensors import STEPS_BACK_FOR_RESTART
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
 from fcslam.sources.bags.transforms import in_space
-from fcslam.wire.fleet_replies import FrontierReply, MapFrontiers, QualityReply
+from fcslam.wire.fleet_replies import Apart, FrontierReply, MapFrontiers, QualityReply, TeammatePose
 from tests import small_fleet
 from tests.live.same_thread import SameThread
 from tests.ros.memory_network import MemoryNetwork, offered
@@ -312,13 +311,13 @@ class FollowedFleet:
 
     def robots(self):
         return [
-            Teammate("robot1", 0, "", np.zeros(3), 0.2),
-            Teammate("r-2", 0, "", np.array([1.0, 2.0, 0.5]), 1.5),
-            Teammate("3", 1, "up", np.zeros(3), 0.0),
+            TeammatePose(robot="robot1", map=0, floor="", pose=(0.0, 0.0, 0.0), age_s=0.2, stamp=0.0),
+            TeammatePose(robot="r-2", map=0, floor="", pose=(1.0, 2.0, 0.5), age_s=1.5, stamp=0.0),
+            TeammatePose(robot="3", map=1, floor="up", pose=(0.0, 0.0, 0.0), age_s=0.0, stamp=0.0),
         ]
 
     def separations(self):
-        return (((0, 1), "no two of their places look alike"),)
+        return (Apart(maps=(0, 1), explanation="no two of their places look alike"),)
 
 
 class FleetRobot:

@@ -13,7 +13,7 @@ import numpy as np
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.edits import is_cut, is_removed, stamps_of
 from fcslam.cloud.joining import CONSISTENCY, decide_join, reevaluate
-from fcslam.cloud.joint_graph import SOLVED_SHARE, SURPRISE_M, SURPRISE_RAD, JointGraph
+from fcslam.cloud.joint_graph import AGREES_SIGMAS, SOLVED_SHARE, SURPRISE_M, SURPRISE_RAD, JointGraph
 from fcslam.cloud.map_comparison import MapComparison
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.session_store import SessionStore
@@ -52,8 +52,6 @@ DECIDED_GROWTH = 1.0 + SOLVED_SHARE
 decision tests every pair of closures: at each place, it would take longer than all else where robots meet for hours."""
 DECIDED_EACH_TIME = 100
 """Up to this many closures, two sessions are decided at each new one."""
-MOST_SIGMAS = 3.0
-"""Walls that fit only farther off than this many standard deviations of the user's pose show another place."""
 
 Scans = Sequence[tuple[PointScan, FloatArray]]
 """Scans around a keyscan, and their poses (3,) in its base."""
@@ -317,5 +315,5 @@ def measured(made: ManualClosure, i: Scans, j: Scans) -> tuple[FloatArray, Float
         return guess, information
     found = verify(build_submap(i), build_submap(j), guess, VERIFICATION, information)
     off = np.abs(se2.between(guess, found.T_a_b))
-    fits = found.loose and np.hypot(off[0], off[1]) <= MOST_SIGMAS * metres and off[2] <= MOST_SIGMAS * radians
+    fits = found.loose and np.hypot(off[0], off[1]) <= AGREES_SIGMAS * metres and off[2] <= AGREES_SIGMAS * radians
     return (found.T_a_b, found.information) if fits else (guess, information)

@@ -17,6 +17,8 @@ from fcslam.storage.state_file import State
 
 SURPRISE_M, SURPRISE_RAD = 0.5, 0.1
 """A closure that differs from the joint map by so much needs a cluster of closures."""
+AGREES_SIGMAS = 3.0
+"""What is within so many standard deviations of a measurement agrees with it."""
 SOLVED_SHARE = 0.05
 """Share of all closures that comes in between two solves, at least."""
 

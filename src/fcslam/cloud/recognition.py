@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.cloud.closure_log import ClosureLog
-from fcslam.cloud.joint_graph import JointGraph
+from fcslam.cloud.joint_graph import AGREES_SIGMAS, JointGraph
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import robot_of
 from fcslam.cloud.settings import FleetConfig
@@ -39,8 +39,6 @@ _VocabularyKey = tuple[Channel, str, str]
 
 SIGHT_M = 6.0
 """Largest distance at which places in the same map are compared."""
-START_SIGMAS = 3.0
-"""A closure within so many standard deviations of the known starts agrees with them."""
 NEAR_VISITS = 2
 """Earlier visits of each robot that are compared with a new place; of robots that closures nearby tie together, two
 count."""
@@ -212,7 +210,7 @@ class PlaceRecognition:
         for session in starts:
             numbers = self._places.get((key, session), _NO_PLACES)[:, 0]
             T_starts = se2.between(starts[session], starts[place.id.robot])
-            within_m = START_SIGMAS * float(np.sqrt(2.0) * sigma_m + sigma_rad * np.hypot(*T_starts[:2]))
+            within_m = AGREES_SIGMAS * float(np.sqrt(2.0) * sigma_m + sigma_rad * np.hypot(*T_starts[:2]))
             if session in map_sessions or not len(numbers) or within_m > self._config.consistency.separation_m:
                 continue
             T_start_i = dict(zip(numbers.tolist(), self._from_start(session, numbers), strict=True))
@@ -223,7 +221,7 @@ class PlaceRecognition:
             for match in self._matcher(key).match_at(place, expected):
                 T_start_found = se2.compose(T_start_i[match.i.number], match.T_i_j)
                 off = se2.between(T_starts, se2.compose(T_start_found, se2.inverse(T_start_place)))
-                if np.hypot(off[0], off[1]) < within_m and abs(off[2]) < START_SIGMAS * np.sqrt(2.0) * sigma_rad:
+                if np.hypot(off[0], off[1]) < within_m and abs(off[2]) < AGREES_SIGMAS * np.sqrt(2.0) * sigma_rad:
                     yield match
 
     def _from_start(self, session: str, numbers: NDArray[np.int64]) -> FloatArray:

@@ -7,7 +7,6 @@ A thread follows the cloud. No scan waits for it, and while the cloud is away ev
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -15,34 +14,18 @@ import numpy as np
 from fcslam.errors import FcslamError, UnavailableError
 from fcslam.maps.joint_tiles import LARGEST_ANSWER, TiledMap, decode_batch
 from fcslam.maps.occupancy_map import OccupancyMap
-from fcslam.records import FloatArray, frozen
-from fcslam.robot.sender import retry_delay_s
+from fcslam.records import FloatArray
+from fcslam.robot.sender import ASK_AFTER_S, retry_delay_s
 from fcslam.robot.uplink import STOP_TIMEOUT_S
 from fcslam.wire.fleet_client import FleetClient
-from fcslam.wire.fleet_replies import FleetReply, MapFrontiers, QualityReply
+from fcslam.wire.fleet_replies import Apart, FleetReply, MapFrontiers, QualityReply, TeammatePose
 
 POLL_S: Final = 0.5
 """Time between two looks at the fleet."""
-ADVICE_S: Final = 5.0
-"""Time between two looks at the frontiers and at how good the map is."""
 DOWNLINK_KB_PER_S: Final = 15.0
 """Limit of the tiles, kB per second, without a budget."""
 MOST_NEWS: Final = 1000
 """Changes of the fleet that are kept."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Teammate:
-    """A robot of the fleet, possibly this one."""
-
-    robot: str
-    map_index: int
-    """Robots with the same index share a map."""
-    floor: str
-    T_map_base: FloatArray
-    """Shape (3,), in its map, metres and radians."""
-    age_s: float
-    """Time since it was there."""
 
 
 class FleetView:
@@ -116,21 +99,17 @@ class FleetView:
         others = [one for one in self.robots() if one.map_index == map_index and one.robot != self._robot]
         return np.array([(*one.T_map_base[:2], one.age_s) for one in others], np.float64).reshape(-1, 3)
 
-    def robots(self) -> list[Teammate]:
+    def robots(self) -> list[TeammatePose]:
         """All robots that the cloud knows, with the ages of their poses now."""
         if self._reply is None:
             return []
         reply, came_s = self._reply
         since_s = self.clock() - came_s
-        return [
-            Teammate(one.robot, one.map_index, one.floor, frozen(np.array(one.T_map_base)), one.age_s + since_s)
-            for one in reply.robots
-        ]
+        return [one.model_copy(update={"age_s": one.age_s + since_s}) for one in reply.robots]
 
-    def separations(self) -> tuple[tuple[tuple[int, int], str], ...]:
+    def separations(self) -> tuple[Apart, ...]:
         """For every two maps that are apart: their indices and the reason."""
-        apart = () if self._reply is None else self._reply[0].separations
-        return tuple((one.maps, one.explanation) for one in apart)
+        return () if self._reply is None else self._reply[0].separations
 
     def step(self) -> None:
         """Ask once."""
@@ -158,7 +137,7 @@ class FleetView:
         self._tell(before, self._in_map())
         if is_complete:  # the poses came before the tiles, so the tiles hold at least this keyscan
             self.drawn_s = stamp
-        if self.clock() - self._advised_s >= ADVICE_S:
+        if self.clock() - self._advised_s >= ASK_AFTER_S:
             self._advised_s = self.clock()
             self.frontiers, self.quality = client.frontiers(self._robot), client.quality(self._robot)
 

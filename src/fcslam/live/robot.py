@@ -21,6 +21,7 @@ from fcslam.api import settings_of
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import InputError, PacketError
 from fcslam.geometry import se2
+from fcslam.lidar.frontend import ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_RAD
 from fcslam.live.fleet_view import FleetView
 from fcslam.live.inputs import Lasers, checked_camera, checked_image, checked_stamp
 from fcslam.live.joint_map import JointMap
@@ -56,7 +57,7 @@ from fcslam.wire.http_transport import HttpTransport, Server
 from fcslam.wire.keys import Credentials
 from fcslam.wire.messages import Packet
 
-EVENT_M, EVENT_RAD = 0.01, 0.005
+EVENT_M, EVENT_RAD = ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_RAD
 """Corrections that move the robot by less are not events."""
 
 POLL_INTERVAL_S = 0.1

@@ -110,8 +110,6 @@ class Task(Enum):
 
 VOCABULARY = VocabularyConfig()
 """Vocabulary of the places of one robot."""
-READY = 64
-"""Places whose descriptors are kept ready: successive submaps are compared with the same ones."""
 PLACED_AFTER = 20
 """Keyframes after which the poses of all keyscans are written again."""
 
@@ -296,7 +294,7 @@ class OwnPlaces:
     def __init__(self, vocabulary: VocabularyConfig = VOCABULARY) -> None:
         self._keypoints_m: dict[int, NDArray[np.float32]] = {}
         self._index: PlaceIndex[int] = PlaceIndex(vocabulary, np.random.default_rng(0))
-        self._descriptors = lru_cache(READY)(self._index.descriptors)
+        self._descriptors = lru_cache(self._index.descriptors)
         """Those of a place in the index, which holds each descriptor once."""
         self._waiting: dict[int, Codes] = {}
         """Descriptors of the places that the index lacks: a robot whose loops are short never asks it."""

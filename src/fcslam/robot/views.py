@@ -14,13 +14,12 @@ from fcslam.features.detector_file import open_detector_file
 from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.lidar_depth import LidarView, locate_among
 from fcslam.geometry import se2
+from fcslam.lidar.first_motion import LONGEST_GAP_S
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.scan import point_scan
 from fcslam.records import CameraImage, Channel, DetectorFile, FloatArray, KeyscanId, LaserScan, Place, frozen
 from fcslam.robot.keyframe_folder import KeyframeFolder, KeyframeImage
 
-SCAN_AGE_S = 1.0
-"""Scans of several lasers that are older than the newest by more are not combined with it."""
 EVERY_M, EVERY_RAD = 1.0, 0.5
 """Travel or turn after which an image becomes a camera place; after the turn, about half of the view is new."""
 FEWEST_KEYPOINTS = 20
@@ -85,7 +84,7 @@ class ViewExtractor:
         T_scan_image = se2.between(scan.T_odom_base, odometry)
         T_keyscan_image = se2.compose(pose.T_keyscan_base, T_scan_image)
         surroundings = tuple(
-            _lidar_view(other, odometry) for other in scans if abs(scan.stamp - other.stamp) <= SCAN_AGE_S
+            _lidar_view(other, odometry) for other in scans if abs(scan.stamp - other.stamp) <= LONGEST_GAP_S
         )
         keyframe = KeyframeImage(pose.keyscan, image.encoded, image.camera, surroundings, T_keyscan_image)
         view = self._describe(keyframe, picture)

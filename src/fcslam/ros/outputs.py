@@ -18,8 +18,7 @@ from fcslam.sources.bags.codec import TRANSFORMS, MessageCodec
 from fcslam.sources.bags.transforms import in_space
 
 if TYPE_CHECKING:
-    from fcslam.live.fleet_view import Teammate
-    from fcslam.wire.fleet_replies import QualityReply
+    from fcslam.wire.fleet_replies import Apart, QualityReply, TeammatePose
 
 GRID, POSE, PATH = "nav_msgs/OccupancyGrid", "geometry_msgs/PoseWithCovarianceStamped", "nav_msgs/Path"
 MARKERS, DIAGNOSTICS = "visualization_msgs/MarkerArray", "diagnostic_msgs/DiagnosticArray"
@@ -154,13 +153,13 @@ class Outputs:
     def fleet(
         self,
         now_ns: int,
-        teammates: "Sequence[Teammate]",
-        separations: Sequence[tuple[tuple[int, int], str]],
+        teammates: "Sequence[TeammatePose]",
+        separations: "Sequence[Apart]",
         own: int | None,
     ) -> None:
         """Publish where the robots of the own map are, and which of all robots, this one as well, are in which map.
 
-        ``separations`` are the indices of every two maps that are apart, and the reason. ``own`` is the index of the
+        ``separations`` are every two maps that are apart. ``own`` is the index of the
         robot's own map; None: no pose is in its frame.
         """
         make, frame = self._codec.make, self._map_frame
@@ -168,7 +167,7 @@ class Outputs:
             self._begin(FLEET_POSES, POSES, STREAMED)
             self._begin(FLEET_STATUS, DIAGNOSTICS, STREAMED)
             near = [mate for mate in teammates if mate.map_index == own]
-            poses = [self._codec.pose(in_space(mate.T_map_base)) for mate in near]
+            poses = [self._codec.pose(in_space(np.array(mate.T_map_base))) for mate in near]
             self._send(FLEET_POSES, POSES, make(POSES, header=self._codec.header(now_ns, frame), poses=poses))
             for mate in near:
                 topic = f"fleet/{_topic_name(mate.robot)}/pose"
@@ -177,7 +176,7 @@ class Outputs:
                 self._teammates.add(topic)
                 self._begin(topic, POSE_STAMPED, STREAMED)
                 stamp_ns = max(0, now_ns - nanoseconds(mate.age_s))
-                self._send(topic, POSE_STAMPED, self._posed(stamp_ns, mate.T_map_base))
+                self._send(topic, POSE_STAMPED, self._posed(stamp_ns, np.array(mate.T_map_base)))
             statuses = [
                 self._status(
                     f"robot {mate.robot}",
@@ -190,15 +189,16 @@ class Outputs:
                         "age_s": f"{mate.age_s:.2f}",
                         **{
                             axis: f"{value:.4f}"
-                            for axis, value in zip(("x", "y", "theta"), mate.T_map_base.tolist(), strict=True)
+                            for axis, value in zip(("x", "y", "theta"), mate.T_map_base, strict=True)
                         },
                     },
                 )
                 for mate in teammates
             ]
             statuses += [
-                self._status(f"maps {a} and {b}", "", self._levels.WARN, why, {"map_a": a, "map_b": b})
-                for (a, b), why in separations
+                self._status(f"maps {a} and {b}", "", self._levels.WARN, apart.explanation, {"map_a": a, "map_b": b})
+                for apart in separations
+                for a, b in [apart.maps]
             ]
             self._diagnose(FLEET_STATUS, now_ns, statuses)
 
