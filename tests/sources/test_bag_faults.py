@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fcslam.errors import SourceError
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from fcslam.sources import BagOptions, Fault, FaultCount, open_fleet, open_source
+from fcslam.sources import BagOptions, Fault, open_fleet, open_source
 from tests.sources.bag_messages import (
     END,
     LASER_POSE,
@@ -149,23 +149,20 @@ def test_a_clock_that_steps_back_once_is_kept_from_there(tmp_path):
     assert [len(track.stamps) for track in frontend.tracks] == [60, 51]
 
 
-def test_a_gap_in_the_odometry_is_counted(tmp_path):
-    said = [message for message in drive(60) if message.topic != "/odom" or not 104.0 < message.bag_time < 107.0]
+@pytest.mark.parametrize(
+    ("lost", "scans", "faults"),
+    [
+        ((104.0, 107.0), 60, {Fault.ODOMETRY_GAP: 15}),
+        ((0.0, 104.05), 60 - 16, {Fault.NO_ODOMETRY: 16, Fault.HELD_ODOMETRY: 5}),
+    ],
+    ids=["a gap", "none at the beginning"],
+)
+def test_scans_without_odometry_around_them_are_counted(tmp_path, lost, scans, faults):
+    said = [message for message in drive(60) if message.topic != "/odom" or not lost[0] < message.bag_time < lost[1]]
     source = open_source(save(tmp_path / "run.bag", said))
-    assert len(scans_of(source)) == 60
-    assert source.faults[Fault.ODOMETRY_GAP].count == 15
+    assert len(scans_of(source)) == scans == source.survey().scan_count
+    assert {kind: source.faults[kind].count for kind in faults} == faults
     assert source.survey().faults.counts == source.faults.counts
-
-
-def test_scans_before_the_odometry_are_left_out_and_counted(tmp_path):
-    said = [message for message in drive(60) if message.topic != "/odom" or message.bag_time > 104.0]
-    source = open_source(save(tmp_path / "run.bag", said))
-    assert len(scans_of(source)) == 60 - 16 == source.survey().scan_count
-    assert source.faults[Fault.NO_ODOMETRY] == FaultCount(16, 1)
-    assert source.faults[Fault.HELD_ODOMETRY].count == 5
-
-
-# Beams
 
 
 # Broken messages

@@ -25,8 +25,6 @@ pytestmark = [
         ("slam-benchmark/fr079.clf.xz", (4934, 360), 392, 1061, -0.04),
         ("slam-benchmark/mit-csail.clf.xz", (1988, 361), 374, 424, 0.0),
         ("ual-campus/ual_2014_05_23.clf.xz", (3318, 361), 524, 181, 2.0),
-        ("wean-hall/robotdata1.log.gz", (713, 180), 41.2, 135, 0.25),
-        ("wean-hall/robotdata2.log.gz", (2251, 180), 87.2, 240, 0.25),
         ("rosbag1/fr079.sort.bag", (4934, 360), 392, 1061, 0.04),
         ("rosbag1/mit-csail.sort.bag", (1988, 361), 374, 424, 0.0),
     ],
