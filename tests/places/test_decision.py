@@ -12,6 +12,7 @@ from fcslam.mission.mission import MissionConfig
 from fcslam.places.index import PlaceIndex
 from fcslam.places.matcher import PlaceMatcher
 from fcslam.records import Channel, KeyscanId, Place, ReasonCode, frozen
+from tests.places.test_vocabulary import walk
 
 pytestmark = pytest.mark.slow
 
@@ -36,17 +37,6 @@ def place(number, codes):
     )
 
 
-def word_of(tree, code):
-    """The leaf that a descriptor reaches, by a walk down the tree."""
-    vertex = 0
-    while tree.child_count[vertex]:
-        first = tree.first_child[vertex]
-        children = range(first, first + tree.child_count[vertex])
-        bits = [sum(int(a ^ b).bit_count() for a, b in zip(tree.centres[c], code, strict=True)) for c in children]
-        vertex = first + bits.index(min(bits))
-    return vertex
-
-
 def bag(words, documents, places):
     """Z_k: tf-idf of each word, divided by the sum."""
     z = {word: count * math.log(places / max(documents[word], 1)) for word, count in Counter(words).items()}
@@ -64,9 +54,9 @@ def algorithm_1(all_codes, delta):
     for j, codes in enumerate(all_codes):
         if index.trained_on is not None:
             tree = index.vocabulary.tree
-            words = [[word_of(tree, code) for code in others.view(np.uint64)] for others in all_codes[:j]]
+            words = [[walk(tree, code) for code in others.view(np.uint64)] for others in all_codes[:j]]
             documents = Counter(word for of_place in words for word in set(of_place))
-            query = bag([word_of(tree, code) for code in codes.view(np.uint64)], documents, j)
+            query = bag([walk(tree, code) for code in codes.view(np.uint64)], documents, j)
             for i in range(1 - j % 2, j, 2):
                 sim = eq_4(query, bag(words[i], documents, j))
                 if sim >= delta:
