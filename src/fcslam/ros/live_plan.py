@@ -14,11 +14,10 @@ from fcslam.sources.bags.rig import (
     Rig,
     mounted_camera,
     mountings_of,
+    recorded_laser,
     rig_of,
     tilt_note,
-    usual_scan,
 )
-from fcslam.sources.bags.sectors import are_sectors, joined_turns
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, NoTransformError, TransformTree
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY
 
@@ -95,11 +94,9 @@ class LivePlanner:
         if not self._is_heard(is_late):
             return None
         self.base_frame = base_frame = self.known_base_frame
-        in_sectors = [are_sectors(scans) for scans in self._first]
-        turns = [joined_turns(scans) if is_in else scans for is_in, scans in zip(in_sectors, self._first, strict=True)]
         lasers = tuple(
-            RecordedLaser(Topic(topic, self._topics.kinds[topic], len(scans)), usual_scan(scans), is_in)
-            for topic, scans, is_in in zip(self._topics.scans, turns, in_sectors, strict=True)
+            recorded_laser(Topic(topic, self._topics.kinds[topic], len(scans)), scans)
+            for topic, scans in zip(self._topics.scans, self._first, strict=True)
         )
         try:
             mountings = mountings_of(lasers, self.tree, base_frame, self._options.laser_poses)
@@ -118,7 +115,7 @@ class LivePlanner:
         for topic, mounted in zip(self._topics.scans, mountings, strict=True):
             if tilt := tilt_note(mounted):
                 self._notify(f"the laser of {topic} is {tilt}")
-        farthest_m = [max(scan.range_max_m for scan in scans) for scans in turns]
+        farthest_m = [max(scan.range_max_m for scan in scans) for scans in self._first]
         for scans in self._first:
             scans.clear()
         return LivePlan(rig_of(lasers, farthest_m, mountings, camera), lasers, self._edge)

@@ -17,9 +17,9 @@ from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import OdometryReading, odometry_in
 from fcslam.sources.bags.options import NO_ODOMETRY, BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Message
-from fcslam.sources.bags.rig import RecordedLaser, usual_scan
+from fcslam.sources.bags.rig import RecordedLaser, recorded_laser
 from fcslam.sources.bags.robots import BagRobot, listed, usual
-from fcslam.sources.bags.sectors import are_sectors, cloud_sector_rad, joined_turns
+from fcslam.sources.bags.sectors import cloud_sector_rad
 from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree
 from fcslam.sources.contradictions import CHANGED, changed_share
@@ -143,8 +143,7 @@ class _Planner:
                 f"{self._path}: each cloud of {topic.name} is a sector of about {degrees(sector_rad):.0f} deg; let the "
                 "driver publish whole turns, or record its laser scans"
             )
-        is_in_sectors = are_sectors(first)
-        return RecordedLaser(topic, usual_scan(joined_turns(first) if is_in_sectors else first), is_in_sectors, frame)
+        return recorded_laser(topic, first, frame)
 
     def _first_error(self, topic: Topic) -> str:
         for message in islice(self._bag.read([topic]), 1):

@@ -16,6 +16,7 @@ from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, ScanMessage, measured_ranges, reversed_sweep
 from fcslam.sources.bags.options import GivenPose
 from fcslam.sources.bags.pairing import PosedImage, PosedScan
+from fcslam.sources.bags.sectors import are_sectors, joined_turns
 from fcslam.sources.bags.transforms import Mounting, NoTransformError, TransformTree, mounting
 from fcslam.sources.gate import usual_beams
 from fcslam.sources.point_clouds import CloudBand
@@ -98,10 +99,12 @@ class Rig(NamedTuple):
         return CameraImage(posed.image.stamp, posed.image.encoded, self.camera, None if pose is None else frozen(pose))
 
 
-def usual_scan(scans: Sequence[ScanMessage]) -> ScanMessage:
-    """The first of these scans of one laser that has its usual beams."""
-    usual = usual_beams([scan.beams for scan in scans])
-    return next(scan for scan in scans if scan.beams == usual)
+def recorded_laser(topic: Topic, first: Sequence[ScanMessage], frame: str | None = None) -> RecordedLaser:
+    """The laser of these first scans."""
+    is_in_sectors = are_sectors(first)
+    turns = joined_turns(first) if is_in_sectors else first
+    usual = usual_beams([scan.beams for scan in turns])
+    return RecordedLaser(topic, next(scan for scan in turns if scan.beams == usual), is_in_sectors, frame)
 
 
 def rig_of(
