@@ -22,6 +22,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import common
 import numpy as np
@@ -32,7 +33,7 @@ sys.path.insert(0, str(common.REPOSITORY))
 from tests.sources import clouds as made
 from tests.sources import test_drivers as drivers
 from tests.sources.bag_messages import odom, quaternion, save, tf
-from tests.sources.test_drivers import START, Scanner, pose_at, times
+from tests.sources.test_drivers import START, Scanner, pose_at
 
 RIGHT_M = 0.02
 SAID = "contradict", "not corrected", "have no times", "was lost", "while the odometry stands still"
@@ -43,7 +44,51 @@ CLOUD_COLUMNS = {"drive": "", "scans": "", "ATE (RMSE), m": ".4f"}
 MOUNTING = (0.1, 0.0, 0.4)
 YAW = 0.4
 """Of the 3D LiDAR."""
+
+
+class Cloud(NamedTuple):
+    """How a 3D LiDAR measures, and what its driver says."""
+
+    layout: tuple
+    first_rad: float = -math.pi
+    clockwise: bool = True
+    parts: int = 1
+    """Messages of a turn."""
+    holes: float = 0.0
+    """Range of a beam without a return."""
+
+
+def times(kind, unit=1.0, since=0.0, name="timestamp"):
+    """A layout whose field has the times of the points in ``unit``."""
+    return 24, [*made.xyz(), (name, kind, 16, lambda measured: np.round((since + measured.times) * unit, 9))]
+
+
 VELODYNE = times("f4", name="time")
+CLOUD_DRIVERS = {
+    "velodyne": Cloud(lambda _: VELODYNE),
+    "ouster, ns and zeros": Cloud(lambda _: times("u4", 1e9, name="t"), first_rad=0.0),
+    "hesai, absolute": Cloud(lambda begin: times("f8", 1.0, begin)),
+    "robosense, NaN": Cloud(lambda begin: times("f8", 1.0, begin), holes=math.nan),
+    "livox, absolute ns": Cloud(lambda begin: times("f8", 1e9, begin), clockwise=False),
+    "sick multiScan, sectors": Cloud(lambda _: times("u4", 1e9, name="t"), parts=10),
+    "velodyne, packets": Cloud(lambda _: VELODYNE, parts=60),
+}
+
+
+def clouds_of(its: Cloud) -> Iterator:
+    """The messages of a 3D LiDAR for 3 s."""
+    R = made.rotation(yaw=YAW)
+    yield tf(START, "base_link", "lidar", MOUNTING, quaternion(YAW), topic="/tf_static")
+    for number in range(30):
+        begin = 0.1 * number
+        turn = made.spinning(
+            lambda t, begin=begin: pose_at(begin + t), MOUNTING, R, 4, 360, its.clockwise, its.first_rad
+        )
+        turn.points[::50] = its.holes
+        for rows in np.array_split(np.arange(len(turn.points)), its.parts):
+            first_s = turn.times[rows[0]]
+            part, at = made.Measured(turn.points[rows], turn.times[rows] - first_s), START + begin + first_s
+            yield made.said("/points", at, made.cloud(at, part, its.layout(START + begin)))
 
 
 def main() -> None:
@@ -78,8 +123,8 @@ def row(kind: str, name: str, messages: Iterable) -> tuple:
 def recordings() -> Iterator[tuple[str, str, Iterable]]:
     """Kind, name and messages of each."""
     yield from (("driver", name, drivers.recording(its)) for name, its in drivers.SCANNERS.items())
-    for name, its in drivers.CLOUDS.items():
-        yield "driver of a 3D LiDAR", name, [*drivers.readings(3.0), *drivers.clouds_of(its)]
+    for name, its in CLOUD_DRIVERS.items():
+        yield "driver of a 3D LiDAR", name, [*drivers.readings(3.0), *clouds_of(its)]
     yield from (("robot", name, make()) for name, (make, _) in drivers.ROBOTS.items())
     yield from (("ranges", name, with_ranges(change)) for name, change in RANGES.items())
     yield from (("odometry", name, with_odometry(change)) for name, change in ODOMETRY.items())

@@ -8,12 +8,7 @@ import sys
 from pathlib import Path
 
 import common
-import numpy as np
 import pytest
-from evaluation import map_search
-from scipy.ndimage import binary_dilation
-
-from fcslam.geometry import se2
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SHARED = ("common", "convert_logs", "processes")
@@ -92,26 +87,6 @@ def test_the_command_is_measured_and_its_failure_ends_the_script():
     assert cost.peak_mb > 5.0  # the system counts what this process held when it forked, so no upper bound
     with pytest.raises(SystemExit, match="failed"):
         common.run_fcslam("map", "no-such-log", "--output", "nowhere")
-
-
-@pytest.mark.slow
-def test_the_search_finds_where_a_piece_was_cut_out():
-    rng = np.random.default_rng(5)
-    free = np.zeros((160, 200), bool)
-    for row, column in zip(rng.integers(20, 110, 8), rng.integers(20, 140, 8), strict=True):
-        free[row : row + 30, column : column + 40] = True
-    walls = binary_dilation(free) & ~free
-    whole = map_search.Plan(walls, free, 0.1, np.array([-3.0, 2.0]))
-    T_whole_piece = np.array([4.0, 6.0, 2.2])
-    corner = np.array([-9.0, -9.0])
-    cells = [np.zeros((180, 180), bool) for _ in range(2)]
-    for into, of in zip(cells, (walls, free), strict=True):
-        points = se2.transform(se2.inverse(T_whole_piece), whole.points(of))
-        inside = np.floor((points[np.abs(points).max(axis=1) < 7.0] - corner) / 0.1).astype(int)
-        into[inside[:, 1], inside[:, 0]] = True
-    best, second = map_search.search(map_search.Plan(cells[0], cells[1] & ~cells[0], 0.1, corner), whole)
-    np.testing.assert_allclose(se2.between(T_whole_piece, best.T_target_query), 0.0, atol=0.06)
-    assert second.score < 0.7 * best.score
 
 
 @pytest.fixture

@@ -16,17 +16,14 @@ from evaluation.federated.pairs import (  # noqa: E402
     held_out_pairs,
     measure_pair,
 )
-from evaluation.federated.poison import PoisonedClient  # noqa: E402
 from evaluation.federated.report import report  # noqa: E402
 from evaluation.federated.study import Arm, Study, StudyResults, run_study  # noqa: E402
 
 from fcslam.features.detector import OnnxConfig, OnnxDetector  # noqa: E402
 from fcslam.learning.export import detector_version, export_onnx  # noqa: E402
-from fcslam.learning.federated.messages import TrainingRequest  # noqa: E402
 from fcslam.learning.federated.settings import FederatedSettings  # noqa: E402
 from fcslam.learning.images import find_images  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from tests.learning.federated.fakes import Fake  # noqa: E402
 
 TINY = {
     "rounds": 2,
@@ -150,22 +147,3 @@ def test_gaps_are_paired_and_the_worst_robot_is_named():
     assert rows["federated"].closed_alone == pytest.approx((0.4 - 0.02) / 0.4)
     assert rows["local"].mean == pytest.approx(hard.mean() - 0.2)
     assert rows["local"].closed == pytest.approx(0.0)
-
-
-@pytest.mark.parametrize("poison", ["flipped", "scaled", "reversed", "random", "nan"])
-def test_poison_is_what_it_says(poison):
-    before = {"weight": np.zeros(6, np.float32)}
-    bad = PoisonedClient(Fake("x", answer=lambda *_: {"weight": np.arange(6, dtype=np.float32)}), poison)
-    request = TrainingRequest(True, before, "v", 0, "run", FederatedSettings())
-    sent = bad(request)[0]["weight"]
-    expected = {
-        "flipped": -np.arange(6.0),
-        "scaled": 10 * np.arange(6.0),
-        "reversed": -10 * np.arange(6.0),
-        "nan": np.full(6, np.nan),
-    }
-    if poison == "random":
-        assert sorted(sent) == list(range(6))
-        assert list(sent) != list(range(6))
-    else:
-        assert np.array_equal(sent, expected[poison], equal_nan=True)

@@ -116,18 +116,6 @@ def test_a_perfect_detector_of_unmoved_pictures_scores_one():
     assert figures["mma_3px"] > 0.95
 
 
-@pytest.mark.slow
-def test_a_network_that_finds_nothing_has_no_figures_and_no_alarm(examples):
-    network = KeypointNetwork("light").eval()
-    for layer in (network.body.point_head[-1], network.body.refine[-1]):
-        layer.weight.data.zero_()
-        layer.bias.data.fill_(-20.0)
-    figures = validate(network, validation_pairs(examples), torch.device("cpu"))
-    assert np.isnan(figures["repeatability"])
-    assert figures["mma_3px"] == 0.0
-    assert collapse_warnings(figures) == []
-
-
 def test_the_rate_rises_stays_and_falls():
     settings = TrainingSettings(steps=10_000, learning_rate=1e-3)
     rates = [learning_rate(settings, step) for step in range(10_000)]

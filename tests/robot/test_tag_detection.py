@@ -67,12 +67,6 @@ def test_a_motion_since_the_keyscan_moves_the_tag():
     assert moved.T_base_tag == pytest.approx(se2.compose(T_keyscan_image, plain.T_base_tag), abs=0.02)
 
 
-def test_the_distance_is_proportional_to_the_size_of_the_tag():
-    (true,), (double,) = (seen(robot_at(1.5, 0.7, 0.0), size_m=size_m) for size_m in (0.3, 0.6))
-    camera = np.array(CAMERA.T_base_camera.translation_m[:2])
-    assert double.T_base_tag[:2] - camera == pytest.approx(2.0 * (true.T_base_tag[:2] - camera), rel=0.02)
-
-
 def test_twins_hidden_tags_other_families_and_other_images_are_no_sightings():
     T = robot_at(1.5, 0.7, 0.0)
     beside = replace(TAG, T_building_tag=(0.0, 0.5, 0.0))
