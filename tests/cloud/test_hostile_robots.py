@@ -19,7 +19,7 @@ from tests.small_fleet import fingerprint, in_order, map_of
 pytestmark = [pytest.mark.slow, pytest.mark.attack]
 
 PRECISE = frozen(np.diag((1e6, 1e6, 2.5e7)))
-"""The best precision that the cloud does not refuse: 1 mm, 0.2 mrad."""
+"""More precise than scan matching ever is: 1 mm, 0.2 mrad."""
 
 
 def scaled(packets, name, scale):
