@@ -80,6 +80,23 @@ def test_an_own_closure_over_a_distance_is_refused():
     assert "60 m long, at most 50 m" in reason
 
 
+@pytest.mark.parametrize(
+    ("information", "refused"),
+    [((1e6, 1e6, 2.5e7), False), ((1e12, 1e4, 1e4), True), ((1e4, 1e4, 1e9), True), ((1e4, 2e6, 1e4), True)],
+)
+@pytest.mark.parametrize("kind", ConstraintKind)
+def test_a_precision_that_no_lidar_has_is_refused(information, refused, kind):
+    bodies = drive([AHEAD] * 3)
+    claim = replace(
+        motion("a", *((2, 3) if kind is ConstraintKind.ODOMETRY else (0, 3)), np.array(AHEAD), kind),
+        information=frozen(np.diag(information)),
+    )
+    bodies[-1:] = [claim] if kind is ConstraintKind.ODOMETRY else [bodies[-1], claim]
+    reasons = list(refusals(bodies).values())
+    assert bool(reasons) is refused
+    assert not refused or "claims a standard deviation of" in reasons[0]
+
+
 LEAST = {ConstraintKind.ODOMETRY: (0.013, 0.013, 0.003), ConstraintKind.CLOSURE: (0.03, 0.03, 0.006)}
 """Standard deviations of scan matching at its best, over a metre with 0.2 rad."""
 

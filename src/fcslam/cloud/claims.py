@@ -14,7 +14,7 @@ from fcslam.lidar.verification import CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Place, TagSighting, frozen
 
 _ROUNDING = 1.01
-"""Information is sent in single precision."""
+"""Information is sent in single precision, and standard deviations are compared by its diagonal."""
 LONGEST_MOTION_M = 20.0
 """Largest motion between two consecutive keyscans, metres."""
 LONGEST_CLOSURE_M = 50.0
@@ -25,6 +25,10 @@ MOST_SUBMAP_KEYSCANS = 2000
 """Largest number of keyscans in a submap."""
 FARTHEST_TAG_M = LONGEST_CLOSURE_M
 """Largest distance at which a camera reads a tag, metres."""
+LEAST_SIGMA_M = 0.001
+"""Least standard deviation of a position that a robot measures, metres."""
+LEAST_SIGMA_RAD = 0.0002
+"""Least standard deviation of a heading that a robot measures, radians."""
 
 
 class ClaimLimits(Settings):
@@ -51,6 +55,12 @@ def check_constraint(constraint: Constraint, largest_m: float) -> None:
     length_m = math.hypot(constraint.T_i_j[0], constraint.T_i_j[1])
     if not length_m <= largest_m:
         raise PacketError(f"{name} is {length_m:.4g} m long, at most {largest_m:g} m")
+    x, y, theta = (constraint.information.diagonal() / _ROUNDING).tolist()
+    if max(x, y) > LEAST_SIGMA_M**-2 or theta > LEAST_SIGMA_RAD**-2:
+        raise PacketError(
+            f"{name} claims a standard deviation of {max(x, y) ** -0.5:.3g} m and {theta**-0.5:.3g} rad, at least "
+            f"{LEAST_SIGMA_M:g} m and {LEAST_SIGMA_RAD:g} rad"
+        )
 
 
 def with_least_noise(constraint: Constraint) -> Constraint:

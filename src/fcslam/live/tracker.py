@@ -26,15 +26,8 @@ from fcslam.wire.messages import Packet
 
 UNDETERMINED_S = 1.0
 """The robot reports scans without odometry that leave a direction open for longer."""
-QUIET = (
-    EventKind.CORRECTED,
-    EventKind.ONLINE,
-    EventKind.JOINED,
-    EventKind.FLEET,
-    EventKind.RELOCALIZED,
-    EventKind.LOCALIZED,
-)
-"""Events that are logged as information; the others are warnings."""
+WARNINGS = EventKind.LOST, EventKind.FLOOR, EventKind.UNDETERMINED, EventKind.OFFLINE, EventKind.FAILED
+"""Events that are logged as warnings; the others are information."""
 
 _log = logging.getLogger(__name__)
 
@@ -212,7 +205,7 @@ class LiveTracker(ABC):
             self._event(EventKind.FAILED, text)
 
     def _event(self, kind: EventKind, text: str) -> None:
-        level = logging.INFO if kind in QUIET else logging.WARNING
+        level = logging.WARNING if kind in WARNINGS else logging.INFO
         _log.log(level, "%s: %s", self.name, text)
         if self._on_event is not None:
             self._on_event(RobotEvent(kind, self._newest_s, text))

@@ -30,6 +30,7 @@ HEADING_SIGMA_RAD: Final = 0.02
 """Standard deviation of a heading besides that of the corners."""
 LARGEST_SIGMAS: Final = np.array((0.5, 0.5, 0.25))
 """A pose with a larger standard deviation, in metres and radians, is not sent."""
+WORST_CONDITION: Final = 1e12
 
 
 class TagsConfig(Settings):
@@ -142,7 +143,7 @@ def tag_in_base(
         return None
     jacobian: FloatArray = np.array(fitted[0].jac)
     hessian, projection = jacobian.T @ jacobian, approx_fprime(best, in_plane)
-    if not np.linalg.cond(hessian) < 1.0 / np.finfo(np.float64).eps:
+    if not np.linalg.cond(hessian) < WORST_CONDITION:
         return None
     covariance = projection @ np.linalg.inv(hessian) @ projection.T
     fixed, relative = POSITION_SIGMA
