@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from evaluation.baselines import Fast, FloatFeatures, Harris, ShiTomasi, Sift, logit_features
+from evaluation.baselines import Fast, Harris, ShiTomasi, Sift, logit_features
 
 from fcslam.features.detector import OnnxConfig, OnnxDetector
 from tests.features.networks import tiny_network
@@ -25,13 +25,6 @@ def test_detectors_to_compare_with_find_what_a_shifted_image_has_shifted(detecto
     assert np.mean(gaps < 1.0) > 0.8
     empty = detector.detect(np.full((64, 64), 100, np.uint8))
     assert empty.keypoints_px.shape == (0, 2)
-
-
-def test_sift_describes_by_numbers(image):
-    features = Sift(100).detect(image)
-    assert isinstance(features, FloatFeatures)
-    assert features.descriptors.shape == (len(features.scores), 128)
-    assert Sift(100).detect(np.zeros((64, 64), np.uint8)).descriptors.shape == (0, 128)
 
 
 def test_logits_are_floats_of_unit_length_whose_signs_are_the_bits(image, tmp_path):

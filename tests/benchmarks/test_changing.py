@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from worlds.changing import ChangingBuilding, close_doors, doors_after, doors_of
+from worlds.changing import ChangingBuilding, close_doors
 
-from fcslam.lab.simulation.floorplan import draw_floor_plan
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.options import Building
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
@@ -43,16 +42,3 @@ def test_closed_doors_are_on_no_way(robots):
         assert closed
         for door in closed:
             assert np.linalg.norm(robot.T_building_base[:, :2] - door.centre, axis=1).min() > 0.9
-
-
-def test_doors_that_a_robot_drives_through_are_open_and_far_ones_stay_as_they_were():
-    plan = draw_floor_plan(np.random.default_rng(4))
-    doors = doors_of(plan)
-    centres = np.array([door.centre for door in doors])
-    everything = frozenset(range(len(doors)))
-    far = frozenset(np.flatnonzero(np.linalg.norm(centres - centres[0], axis=1) > 4.0).tolist())
-    assert 0 < len(far) < len(doors) - 1
-    through = doors_after(plan, everything, 1.0, centres[:1], np.random.default_rng(0))
-    assert through == everything - {0}
-    assert doors_after(plan, everything, 0.0, centres[:1], np.random.default_rng(0)) == far
-    assert doors_after(plan, frozenset(), 1.0, centres[:1], np.random.default_rng(0)) == everything - far - {0}

@@ -91,16 +91,6 @@ def test_ticks_follow_the_circle_that_the_wheels_are_on(tmp_path, older, left_sp
         np.testing.assert_allclose(se2.between(np.array(circle), scan.T_odom_base), 0.0, atol=3e-3)
 
 
-def test_the_rovers_laser_looks_past_its_body(tmp_path):
-    ranges = [0] * 70 + [7, 19, 20, *range(1003, 1542)] + [0] * 70
-    scans = converted(tmp_path / "exp.dat", [ticks_line(100_000 * k, 100 * k, 100 * k, ranges) for k in range(3)])
-    laser = scans[0].laser
-    assert laser.beam_count == 542
-    assert laser.angles_rad()[270] == pytest.approx(0.0, abs=1e-9)
-    assert laser.T_base_laser == (0.145, 0.0, 0.0)
-    np.testing.assert_allclose(scans[0].ranges_m[:4], [0.0, 0.0, 0.02, 1.003], rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     "damaged",
     ["", "1 2 3", ticks_line(1, 10**30, 2), ticks_line(1, "nan", 2), ticks_line("now", 1, 2), ticks_line(8e6, 10**9, 2),

@@ -7,7 +7,7 @@ import pytest
 from fcslam.learning.homography import inverse, warp
 from fcslam.learning.labels import Labels, Teacher
 from fcslam.learning.pairs import TrainingExample, draw_pair, splat_points
-from fcslam.learning.warps import random_change, random_view, relight, visible_mask, warp_image, well_inside
+from fcslam.learning.warps import random_change, random_view, visible_mask, warp_image, well_inside
 from tests.learning.textures import textured
 
 SIZE = (96, 80)
@@ -48,14 +48,6 @@ def test_what_is_seen_is_the_image():
     places = warp(inverse(homography), np.stack((columns, rows), -1).reshape(-1, 2).astype(float))
     expected = well_inside(places, (200, 160), 2.0).reshape(mask.shape)
     assert (mask != expected).mean() < 0.03
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_light_keeps_images_images(seed):
-    lit = relight(textured(seed), np.random.default_rng(seed))
-    assert lit.dtype == np.float32
-    assert lit.shape == (160, 200)
-    assert (lit.min() >= 0.0) & (lit.max() <= 1.0)
 
 
 def test_weights_are_shared_among_four_pixels_about_their_point():
