@@ -192,7 +192,7 @@ class LaserScan:
 
 
 def without(ranges_m: Ranges, beams: NDArray[np.bool_] | None) -> Ranges:
-    """The ranges, shape (beam_count,), with 0, no return, for ``beams``, shape (beam_count,); None: for no beam."""
+    """The ranges, shape (beam_count,), with 0, invalid, for ``beams``, shape (beam_count,); None: for no beam."""
     return ranges_m if beams is None else np.where(beams, np.float32(0.0), ranges_m)
 
 
