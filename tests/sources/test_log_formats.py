@@ -11,7 +11,7 @@ from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.records import LaserScan, Odometry
 from fcslam.sources import Fault, FaultCount, open_source
-from fcslam.sources.logs.textlog import TextLog
+from fcslam.sources.logs.carmen_log import CarmenLog
 from tests.sources.camera_records import same
 from tests.sources.carmen_text import BEAMS, drive, flaser, odom, peak_of, pose_at, robotlaser, save, scans_of
 
@@ -159,7 +159,7 @@ def test_scans_without_poses_take_that_of_the_odometry_before_them(tmp_path):
 def test_a_short_log_is_parsed_once_and_a_long_one_in_each_pass_with_the_same_result(tmp_path):
     lines = drive(10)
     path = save(tmp_path / "run.log", [*lines[:9], "FLASER damaged", *lines[9:]])
-    short, long = open_source(path), TextLog(path, "run", kept_bytes=500)
+    short, long = open_source(path), CarmenLog(path, "run", kept_bytes=500)
     survey = short.survey()
     assert long.survey() == survey
     path.rename(tmp_path / "away.log")
@@ -177,7 +177,7 @@ def test_a_short_log_is_parsed_once_and_a_long_one_in_each_pass_with_the_same_re
 @pytest.mark.slow
 def test_memory_hardly_depends_on_the_length(tmp_path):
     def peak_bytes(scans):
-        return peak_of(TextLog(save(tmp_path / f"{scans}.log", drive(scans, beams=90)), "run", kept_bytes=50_000))
+        return peak_of(CarmenLog(save(tmp_path / f"{scans}.log", drive(scans, beams=90)), "run", kept_bytes=50_000))
 
     peak_bytes(600)
     assert peak_bytes(4000) < peak_bytes(1000) + 60 * 3000, "some numbers for each scan, and not its ranges"

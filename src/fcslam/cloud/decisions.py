@@ -1,6 +1,6 @@
 """Decisions about closures as they arrive: which are accepted, and which maps they join.
 
-``reevaluation`` decides all of them again for the final result.
+``joining.reevaluate`` decides all of them again for the final result. The rule itself is ``graph.evidence.shortfall``.
 """
 
 from collections.abc import Iterable, Sequence

@@ -15,7 +15,7 @@ from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_errors
 from fcslam.sources.logs.carmen import is_carmen
-from fcslam.sources.logs.textlog import TextLog
+from fcslam.sources.logs.carmen_log import CarmenLog
 from fcslam.sources.source import Source
 from fcslam.untrusted import open_file
 
@@ -102,7 +102,7 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
                 f"{path}: a {LOG} has neither topics nor tf; --sensors and a robot after a colon go with ROS bags "
                 "only, leave them out"
             )
-        return TextLog(path, name or _robot_name(path))
+        return CarmenLog(path, name or _robot_name(path))
     if robot is not None:
         options = replace(options or BagOptions(), robot=robot)
         name = name or robot.strip("/").replace("/", "_")

@@ -45,7 +45,7 @@ class _Reading(NamedTuple):
     placeholders: tuple[float, ...]
 
 
-class TextLog:
+class CarmenLog:
     """A log with one message per line, compressed or not."""
 
     def __init__(self, path: Path, name: str, kept_bytes: int = KEPT_BYTES) -> None:
