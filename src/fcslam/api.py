@@ -135,7 +135,9 @@ def localize(
         map: a run folder or mission file; the YAML file of a ROS map; or a map.
         initial_pose: about where the recording starts in the map, (x, y, theta), metres and radians; None: anywhere.
         config: as for ``map_recordings``; ``robot`` counts.
-        output, bag_options, force: as for ``map_recordings``.
+        output: as for ``map_recordings``.
+        bag_options: as for ``map_recordings``.
+        force: as for ``map_recordings``.
         progress: called every 50 scans.
         floor: floor of the recording, whose first map is used; it must be named if the run has maps of several floors.
         update: draw what changed since into the map of the run, where at least ``map.contradicting_scans`` scans show
