@@ -104,11 +104,7 @@ def emit_event(event: str, content: Any) -> None:
 
 
 def run_module(module: str, *arguments: str, timeout_s: float) -> tuple[int, str]:
-    """Run a module to its end; returns its exit code and what it wrote to stdout.
-
-    Raises:
-        TimeoutError: it does not end in time, and is killed.
-    """
+    """Run a module to its end, or kill it (``TimeoutError``); returns its exit code and what it wrote to stdout."""
     command = module_command(module, *arguments)
     try:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
@@ -160,11 +156,7 @@ class Stream(Generic[Item]):
         sending.close()
 
     def __iter__(self) -> Iterator[Item]:
-        """The items; an error of the task is raised here.
-
-        Raises:
-            FcslamError: the process ended too early.
-        """
+        """The items; an error of the task is raised here, or a ``FcslamError`` if its process ended too early."""
         while True:
             try:
                 item, error = pickle.loads(self._receiving.recv_bytes())

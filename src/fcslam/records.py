@@ -469,7 +469,6 @@ class Reason:
         return replace(self, setting=f"{section}.{self.setting}") if self.setting else self
 
     def __str__(self) -> str:
-        """One clause, with the setting in brackets."""
         text = self.code.text.format(value=_short(self.value), limit=_short(self.limit))
         return f"{text} ({self.setting})" if self.setting else text
 

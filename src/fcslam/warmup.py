@@ -191,7 +191,6 @@ def made_up_scans(count: int, scale: float = 1.0, sweep: Sweep | None = None) ->
 
 
 def _ranges(pose: FloatArray, scale: float = 1.0) -> Ranges:
-    """Distance to the nearest wall along every beam, as it is sent, shape (B,)."""
     angles = pose[2] + _LASER.angles_rad()
     facing = _ROOM[:, :2] @ (np.cos(angles), np.sin(angles))
     gaps_m = scale * _ROOM[:, 2:] - _ROOM[:, :2] @ pose[:2, None]

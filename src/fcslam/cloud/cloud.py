@@ -32,7 +32,6 @@ class Cloud(FleetHost):
             CloudConfig(seed=seed, fleet=config, map=grid), lambda number: self._packets[number], verify_pairs
         )
         self._times: dict[PacketNumber, float] = {}
-        """Time of each packet."""
         self._packets: dict[PacketNumber, Packet] = {}
         self._corrections: dict[str, SessionCorrection] = {}
         """The newest that was sent, by session."""

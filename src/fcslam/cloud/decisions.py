@@ -221,7 +221,6 @@ class ClosureDecisions(Kept):
         return self._sessions.nearest(made.robot_i, made.stamp_i), self._sessions.nearest(made.robot_j, made.stamp_j)
 
     def _scans(self, end: KeyscanId) -> Scans:
-        """Scans around a keyscan, with their poses (3,) in its base."""
         first, last = max(end.number - REFINED_KEYSCANS, 0), end.number + REFINED_KEYSCANS
         poses, lasers = self._graph.chain(end.robot, first, last), self._sessions.lasers(end.robot)
         base = poses[end.number - first]

@@ -258,7 +258,6 @@ class Fleet:
         return [e for e in self._decisions.closures if {e.closure.i.robot, e.closure.j.robot} <= present]
 
     def _rigid_fusion(self) -> Fusion | None:
-        """The present rigid maps; None if all robots are in the joint graph."""
         if self._config.fusion is FusionStrategy.JOINT:
             return None
         poses = {session: self._graph.trajectory(session) for session in self._present()}

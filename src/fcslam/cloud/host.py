@@ -31,7 +31,6 @@ class FleetHost:
         read: Callable[[PacketNumber], Packet],
         verify_pairs: VerifyPairs = verify_here,
     ) -> None:
-        """``read`` gives a packet that took effect."""
         self._settings, self._read, self._verify_pairs = config, read, verify_pairs
         self.edits: tuple[Edit, ...] = ()
         """Those that it follows, in their order."""
@@ -64,11 +63,7 @@ class FleetHost:
         return is_new
 
     def apply_next(self, number: PacketNumber, packet: Packet) -> None:
-        """Apply the packet that the log gives next.
-
-        Raises:
-            PacketError: it does not fit what its robot sent before; it has no effect and its number is used up.
-        """
+        """Apply the packet that the log gives next; the number of one that is refused is used up."""
         try:
             self.fleet.apply(packet)
         except PacketError:
@@ -106,6 +101,5 @@ class FleetHost:
 
 
 def _in_map_of(session: str, result: FleetResult) -> dict[str, MappedRobot]:
-    """The sessions in the map of one session, by name; empty before its first keyscan."""
     index = next((mapped.map_index for mapped in result.robots if mapped.robot == session), None)
     return {mapped.robot: mapped for mapped in result.robots if mapped.map_index == index}

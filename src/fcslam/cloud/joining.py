@@ -46,7 +46,6 @@ def decide_join(
 
 
 def _closures(entries: Sequence[ClosureEntry], robot_a: str) -> Closures:
-    """The closures as measurements from robot a to the other."""
     found = [entry.closure for entry in entries]
     closures = Closures(
         np.array([closure.i.number for closure in found], dtype=np.int64),
@@ -59,7 +58,6 @@ def _closures(entries: Sequence[ClosureEntry], robot_a: str) -> Closures:
 
 
 def _tag_numbers(entries: Sequence[ClosureEntry]) -> NDArray[np.int64]:
-    """A number for the tag of each closure; 0: none."""
     tags = [entry.closure.tag for entry in entries]
     numbers = {tag: number for number, tag in enumerate(dict.fromkeys([None, *tags]))}
     return np.array([numbers[tag] for tag in tags], np.int64)

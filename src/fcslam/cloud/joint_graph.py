@@ -198,7 +198,6 @@ class JointGraph:
             self._chains[robot], self._step_covariance[robot] = Rows(path["chain"]), Rows(path["steps"])
 
     def _kept(self) -> NDArray[np.bool_]:
-        """Edges that count, shape (E,)."""
         kept = np.ones(self.graph.edge_count, dtype=bool)
         kept[list(self._left_out)] = False
         return kept

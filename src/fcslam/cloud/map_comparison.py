@@ -179,7 +179,6 @@ class _LocalMaps:
         return keyscans, nearest, is_complete
 
     def scans(self, side: int, keyscans: Sequence[Keyscan], anchor: int) -> list[tuple[PointScan, FloatArray]]:
-        """The scans of keyscans, with their poses (3,) in the keyscan ``anchor``."""
         lasers, poses = self._store.lasers(self._sessions[side]), self._poses[side]
         return [(keyscan_points(k, lasers), se2.between(poses[anchor], poses[k.id.number])) for k in keyscans]
 
@@ -233,7 +232,6 @@ class _LocalMaps:
 
 
 def _separate(poses: FloatArray, rows: NDArray[np.int64], apart_m: float) -> NDArray[np.int64]:
-    """Those of the rows of poses (N, 3) that lie at least so far from those before."""
     chosen: list[int] = []
     for row in rows.tolist():
         if not chosen or np.hypot(*(poses[row, :2] - poses[chosen, :2]).T).min() >= apart_m:
@@ -264,5 +262,4 @@ def _transforms(a: Trajectory, b: Trajectory, members: Closures) -> FloatArray:
 
 
 def _between(T_a_i: FloatArray, T_a_b: FloatArray, T_b_j: FloatArray) -> FloatArray:
-    """T_i_j (3,) of two poses, each in the frame of its trajectory."""
     return se2.compose(se2.between(T_a_i, T_a_b), T_b_j)

@@ -33,7 +33,6 @@ class PacketLog:
     """Whether the packets arrived in the order of their times, as ``canonical`` would give them."""
 
     def __contains__(self, number: PacketNumber) -> bool:
-        """Whether this packet arrived before or was refused."""
         session, sequence = number
         taken = sequence < self._next.get(session, 0)
         return taken or sequence in self._waiting.get(session, ()) or number in self._refused

@@ -278,7 +278,6 @@ def worth_comparing(visits: Mapping[str, Sequence[Visit]], closures: Counter[fro
 
 
 def _tied_groups(robots: Iterable[str], closures: Counter[frozenset[str]]) -> list[list[str]]:
-    """Groups of robots, each tied to the rest of its group by at least ``TIED_CLOSURES``."""
     groups: list[list[str]] = []
     for robot in robots:
         tied = [g for g in groups if sum(closures[frozenset((robot, other))] for other in g) >= TIED_CLOSURES]

@@ -189,7 +189,6 @@ def _map_files(
 
 
 def _certificates(result: FleetResult, maps: Mapping[int, OccupancyMap]) -> dict[int, dict[str, Any]]:
-    """How good each map is where; of the maps that get a picture."""
     from fcslam.maps.certificate import MappedPath, certify  # a live robot has no use for it, and SciPy is large
 
     certificates = {}

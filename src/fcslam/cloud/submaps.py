@@ -75,7 +75,6 @@ class SubmapCache:
         self._unpacked.pop(key, None)
 
     def _scans(self, place: Place) -> list[tuple[PointScan, FloatArray]]:
-        """The scans around a place, and their poses (3,) in its keyscan's base."""
         robot = place.id.robot
         lasers, anchor = self._sessions.lasers(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]
         poses = se2.between(anchor, self._graph.chain(robot, place.first, place.last))

@@ -57,12 +57,10 @@ class SeenTags(Kept):
         self._sessions = sessions
         self._graph = graph
         self._seen: dict[Tag, dict[str, dict[int, TagSighting]]] = {}
-        """By tag, session and keyscan."""
         self._paired: dict[Tag, set[tuple[KeyscanId, str]]] = {}
         """By tag, each keyscan and the session with which it has a closure: one at most, so that the errors of a
         sighting are in one closure."""
         self._tags: Counter[KeyscanId] = Counter()
-        """Number of tags of each keyscan."""
         self._ends: Counter[frozenset[str]] = Counter()
         """Ends of closures by tags between two sessions."""
 

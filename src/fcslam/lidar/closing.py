@@ -179,7 +179,6 @@ class LoopCloser:
         return paths
 
     def _candidates(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
-        """The nearest submap of each earlier visit to the neighbourhood, nearest visits first."""
         travel = self._travel
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
         drift = drift_allowance(paths)[:, 0]

@@ -172,7 +172,6 @@ class _Trial:
         self._weights = np.array([1.0 / len(kind) for kind in kinds for _ in kind])
 
     def agreements(self, facing: Facing) -> FloatArray:
-        """Agreement of each pair with a mounting; NaN if too few points are common."""
         return np.array([_agreement(pair, facing) for pair in self.pairs])
 
     def mean(self, agreements: FloatArray) -> float:
@@ -181,7 +180,6 @@ class _Trial:
         return float((weights * agreements[known]).sum() / weights.sum()) if known.any() else 0.0
 
     def leads(self, scores: FloatArray, others: FloatArray, least: float) -> bool:
-        """Whether one mounting is certainly better than another."""
         gains = scores - others
         known = np.isfinite(gains)
         if np.count_nonzero(known) < FEWEST_PAIRS:
@@ -238,7 +236,6 @@ def _agreement(pair: _Pair, facing: Facing) -> float:
 
 
 def _in_laser(moved: FloatArray, T_base_laser: FloatArray) -> FloatArray:
-    """Motions of the base by odometry, shape (..., 3), as those of the laser."""
     return se2.compose(se2.inverse(T_base_laser), se2.compose(moved, T_base_laser))
 
 

@@ -93,8 +93,6 @@ class Casting(NamedTuple):
 
 
 class _Beams(NamedTuple):
-    """Scans of one laser with the same beams at the same times, stacked."""
-
     ranges_m: Ranges  # (N, beam_count)
     open_m: Ranges  # (N, beam_count): how far beams without return clear; 0 for others
     origins: FloatArray  # (beam_count, 2) in base, as if all were measured at the stamp
@@ -299,7 +297,6 @@ def _open_ranges(ranges_m, max_range_m, step_rad, is_turn, longest_m):  # type: 
 
 @njit
 def _bounds(beams, usable):  # type: ignore[no-untyped-def]
-    """Lowest and highest (x, y) of the lasers, of all returns in usable range and of the beams without return."""
     reach = min(usable, beams.max_range_m)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for k in range(len(beams.ranges_m)):

@@ -123,7 +123,6 @@ cells well away from any surface, shape (M, 2)."""
 
 
 def _drawing(submap: Submap) -> tuple[Drawing, FloatArray]:
-    """The drawing of a map, and its middle (2,) in the map's own coordinates."""
     free, points = submap.free, submap.surface.points
     surface = np.zeros_like(free)
     column, row = np.floor((points - submap.free_corner) / FREE_CELL_M).astype(np.int64).T

@@ -152,7 +152,6 @@ class FleetView:
                 wait_s = getattr(error, "retry_after_s", 0.0) + POLL_S + retry_delay_s(self._failures, self._rng)
 
     def _in_map(self) -> frozenset[str] | None:
-        """The robots in the map that the robot is in; None if it is in none."""
         index = self.map_index
         return None if index is None else frozenset(one.robot for one in self.robots() if one.map_index == index)
 

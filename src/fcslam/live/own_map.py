@@ -31,7 +31,6 @@ class OwnMap:
     """Gets all packets of one robot, in their order, and corrects its poses. Any thread may call."""
 
     def __init__(self, robot: str, config: MissionConfig, executor: Executor, correct: Correct) -> None:
-        """Start a map in the only worker of ``executor``."""
         self._robot, self._correct = robot, correct
         self.failure: str | None = None
         """Why the map stopped growing; None if it grows."""
@@ -110,6 +109,5 @@ def _call_host(cloud: MissionCloud, function: Callable[..., Answer], *arguments:
 
 
 def _apply(cloud: MissionCloud, packets: Sequence[Packet]) -> list[tuple[int, Correction]]:
-    """Apply packets; returns the corrections with their sessions."""
     replies = [reply for packet in packets for reply in cloud.apply(measure(packet))]
     return [(reply.epoch, reply.body) for reply in replies if isinstance(reply.body, Correction)]

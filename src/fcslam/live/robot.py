@@ -369,7 +369,6 @@ class Robot(LiveTracker):
     def _connect(
         self, access: Server | None, folder: Path, wiring: Wiring, follows_fleet: bool, stack: ExitStack
     ) -> Uplink:
-        """Begin to send and to follow the fleet, until ``stack`` is closed."""
         outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", self.name, LARGEST_OUTBOX_BYTES)))
         transport, budget_kBps = wiring.transport, None
         if access is not None:

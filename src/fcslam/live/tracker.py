@@ -44,7 +44,6 @@ class LiveTracker(ABC):
     def __init__(
         self, name: str, laser: Lasers | None, config: MissionConfig, on_event: Callable[[RobotEvent], None] | None
     ) -> None:
-        """Check the arguments; the subclass starts the front end."""
         self.name = checked_robot(name)
         self._lasers = checked_lasers(laser)
         self._config = config
@@ -57,11 +56,9 @@ class LiveTracker(ABC):
         """Stamp of the newest scan that fixed the position; infinity after the event that none does."""
         self._is_finished = False
         self._facing: defaultdict[tuple[float, float, float], list[LaserScan]] = defaultdict(list)
-        """By the mounting of a laser."""
         self._examined: deque[Future[FloorLine | Contradiction | None]] = deque()
         """What the worker finds wrong with each laser: it takes as long as hundreds of scans."""
         self._told: set[str] = set()
-        """Failures that were reported."""
 
     @abstractmethod
     def _take(self, packets: list[Packet]) -> None:

@@ -173,7 +173,7 @@ class RobotBackend:
 
     def _place(self) -> None:
         if self._folder is not None:
-            self._folder.place(self._session.keyscan_poses())
+            self._folder.place(self._session.lidar.keyscan_poses())
         self._unplaced = 0
 
     def _set_detector(self, file: DetectorFile, path: Path) -> None:
@@ -191,7 +191,7 @@ class _Session:
         self._robot = robot
         self._config = config
         self._own_places = OwnPlaces()
-        self._lidar = LidarBackend(robot, config.lidar, self._own_places)
+        self.lidar = LidarBackend(robot, config.lidar, self._own_places)
         self._lasers: tuple[LaserModel, ...] = ()
         self._view_extractor = view_extractor
         self._views: list[Place] = []
@@ -204,18 +204,12 @@ class _Session:
         self._sighted: set[tuple[int, Tag]] = set()
         """Keyscan and tag of every sighting that was sent."""
         self._announced: Hello | None = None
-        """The last hello."""
 
     def add(self, input: NewKeyscan) -> list[Body]:
-        """Add the next keyscan; returns it with its odometry, and the submap that it completes."""
         self._lasers = input.lasers
         bodies = [*self.announcement(), *essential(input)]
-        submap = self._lidar.add(input.keyscan)
+        submap = self.lidar.add(input.keyscan)
         return bodies if submap is None else [*bodies, *self._submap_bodies(submap)]
-
-    def keyscan_poses(self) -> FloatArray:
-        """Pose of every keyscan in the robot's own map, shape (N, 3), metres and radians."""
-        return self._lidar.keyscan_poses()
 
     def describe(self, input: NewImage) -> bool:
         """Describe an image and keep the view until the submap around it is complete; returns whether it is one."""
@@ -225,7 +219,6 @@ class _Session:
         return view is not None
 
     def find_tags(self, input: NewImage) -> Iterator[TagSighting]:
-        """Find the tags that no earlier image of the same keyscan showed."""
         if self._tag_detector is None:
             return
         scan, pose, odometry = input.scan, input.pose, input.image.T_odom_base
@@ -238,8 +231,7 @@ class _Session:
                 yield sighting
 
     def finish(self) -> list[Body]:
-        """End the session; returns the open submaps."""
-        announcement, rest = self.announcement(), self._lidar.finish()
+        announcement, rest = self.announcement(), self.lidar.finish()
         last = rest[-1:]
         return [*announcement, *(body for submap in rest for body in self._submap_bodies(submap, submap in last))]
 

@@ -154,7 +154,6 @@ def _scans_of(laser: LaserModel, source: Source) -> Iterator[LaserScan]:
 
 
 def _contradictions(source: Source) -> list[tuple[Contradiction | None, FloorLine | None]]:
-    """What contradicts the facing of each laser, and the floor that it sees."""
     found = []
     for laser in source.survey().lasers:
         first = list(islice(_scans_of(laser, source), MOST_COMPARED))
@@ -240,7 +239,6 @@ def calibrated(source: Source, config: LidarConfig) -> Source:
 def _tracked(
     records: Iterator[SensorRecord], config: LidarConfig, assumed_s: float
 ) -> tuple[ScanMotions, OdometryTrack | None]:
-    """Track scans without odometry; those without beam times are taken to last ``assumed_s``."""
     frontend = LidarFrontend("calibration", config, PREDICTED)
     prediction, mapped, repeated = MotionPrediction(), MappedScans(config.ignore, config.footprint), RepeatedScans()
     unknown = np.full(3, np.nan)

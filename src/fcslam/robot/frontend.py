@@ -191,11 +191,12 @@ class RobotFrontend:
                 self._describe(self.motion.place_image(record))
 
     def _process_scan(self, scan: LaserScan) -> None:
-        if self.motion.awaits_second(scan):
+        motion = self.motion
+        if isinstance(motion, PredictedMotion) and motion.awaits_second(scan):
             if not self._deferred:
                 self._await_second(scan)
                 return
-            scan = self._deferred.begin_motion(scan, self._session)
+            scan = self._deferred.begin_motion(scan, motion)
             self._map_deferred()
         scan = self._bridge_gap(scan)
         self._deferred.watch_cabin(scan, self._session)
@@ -225,7 +226,7 @@ class RobotFrontend:
         elif self._deferred.follows_gap(before, scan, self._session):
             self._end_deferral()
             scan = self._session.place(scan, before)  # the frame of the predictions may have moved
-            self._deferred.begin_gap(scan.stamp - before.stamp)
+            self._deferred.gap_s = scan.stamp - before.stamp
         return scan
 
     def _defer(self, scan: LaserScan, tracking: TrackingResult) -> None:
@@ -291,7 +292,7 @@ class RobotFrontend:
 
     def _begin(self, track: ScanTrack) -> None:
         self._session = Session(self.robot, len(self.tracks), self._config.lidar, self._motion, track)
-        self._deferred.leave_cabin()
+        self._deferred.cabin.leave()
         self.tracks.append(track)
 
     def _submit(self, input: BackendInput) -> "Future[list[Body]]":

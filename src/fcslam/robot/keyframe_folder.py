@@ -54,7 +54,6 @@ class KeyframeFolder:
     """Writes the keyframes of one start of a robot."""
 
     def __init__(self, folder: Path) -> None:
-        """``folder``: created if it does not exist."""
         self._folder = folder
         self._is_failed = False
         self.session = 0

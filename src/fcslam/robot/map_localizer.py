@@ -76,8 +76,6 @@ class MapEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Vote:
-    """The best alignment of one stretch."""
-
     T_map_odom: FloatArray
     ratio: float
     """Ratio of its score to the best one elsewhere, its lead less for walls in free space of the map."""
@@ -254,7 +252,6 @@ class MapLocalizer:
             self._fix(near.T_a_b, keyscan)
 
     def _vote(self, T_map_base: FloatArray, ratio: float, stretch: Submap, keyscan: MappedKeyscan) -> None:
-        """Count the best alignment of a stretch; with enough evidence it fixes the pose."""
         violation = agreement(stretch, self._map, T_map_base).violation
         cleared = 1.0 + max(0.0, 1.0 - violation / MOST_IN_FREE_SPACE) * (ratio - 1.0)
         T_map_odom = se2.compose(T_map_base, se2.inverse(keyscan.T_local_base))
@@ -270,7 +267,6 @@ class MapLocalizer:
         self._next_search_m = self._searched_m + FIRST_SEARCH_M
 
     def _agree(self, one: "_Vote", other: "_Vote", keyscan: MappedKeyscan) -> bool:
-        """Whether two alignments put the newest keyscan at one pose of the map."""
         ends = (se2.compose(vote.T_map_odom, keyscan.T_local_base) for vote in (one, other))
         gap = se2.between(*ends)
         return bool(np.hypot(gap[0], gap[1]) <= AGREES_M and abs(gap[2]) <= AGREES_RAD)

@@ -74,7 +74,6 @@ class Outbox:
     """Survives a crash of its process at any moment. Two threads may use it, two processes may not."""
 
     def __init__(self, path: Path, robot: str, limit_bytes: int) -> None:
-        """Open the file at ``path``, or create it."""
         self._path = path
         self._limit_bytes = limit_bytes
         self.epoch = self.first_epoch = -1
@@ -255,7 +254,6 @@ class Outbox:
             self._forget(connection, f"epoch = {epoch:d} AND sequence = {sequence:d} AND {_IS_WAITING}")
 
     def _forget(self, connection: sqlite3.Connection, which: str) -> int:
-        """Delete the data of packets that need not be sent any more. Returns their number."""
         count, size = _count(connection, which)
         connection.execute(f"UPDATE packets SET data = NULL WHERE {which}")
         self.waiting = WaitingPackets(self.waiting.packets - count, self.waiting.bytes - size)

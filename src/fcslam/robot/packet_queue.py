@@ -32,7 +32,6 @@ class PacketQueue:
         self._time = float("-inf")
         self._sequence = 0
         self._hello: Hello | None = None
-        """The last hello of the present session."""
 
     @property
     def backlog(self) -> int:

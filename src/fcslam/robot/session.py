@@ -46,7 +46,6 @@ class Session:
     """Tracks and maps the scans of one session, and keeps the newest of them."""
 
     def __init__(self, robot: str, epoch: int, config: LidarConfig, motion: Motion, poses: ScanTrack) -> None:
-        """Begin session number ``epoch`` of a robot; ``poses`` gets those of its scans."""
         self.epoch, self.motion, self.poses = epoch, motion, poses
         self.lidar = LidarFrontend(robot, config, motion.model)
         self.newest: tuple[LaserScan, ScanPose] | None = None
@@ -71,14 +70,19 @@ class Session:
 
     def track(self, scan: LaserScan) -> tuple[LaserScan, TrackingResult]:
         """Localize a scan; returns it as it was deskewed, too."""
+        if isinstance(self.motion, WheelOdometry):
+            return scan, self.lidar.localize(scan)
         return self.motion.track(scan, self.lidar, partial(self._in_odom, scan.stamp))
 
     def observe(self, stamp: float, pose: ScanPose, tracked: TrackedScan) -> None:
-        """Continue the motion from where the scan at ``stamp`` was found."""
-        self.motion.observe(stamp, self.poses.in_odom(pose), tracked)
+        """Continue a prediction from where the scan at ``stamp`` was found; odometry does not depend on that."""
+        if isinstance(self.motion, PredictedMotion):
+            self.motion.observe(stamp, self.poses.in_odom(pose), tracked)
 
     def follow(self, deferred: Deferred, scan: LaserScan, tracking: TrackingResult) -> LaserScan:
         """The next doubtful scan with its motion since those before it."""
+        if isinstance(self.motion, WheelOdometry):
+            return scan
         return self.motion.follow(deferred, scan, tracking.tracked, self.lidar, partial(self._in_odom, scan.stamp))
 
     def drove_on(self, scans: list[LaserScan]) -> bool:
@@ -108,7 +112,6 @@ class Session:
         return None if self.newest is None else NewImage(image, *self.newest, tuple(self._scans.values()))
 
     def _in_odom(self, stamp: float, tracked: TrackedScan) -> FloatArray:
-        """``T_odom_base`` of a localized scan, shape (3,), metres and radians."""
         return self.poses.in_odom(self.lidar.scan_pose(stamp, tracked))
 
     def _keyscan_fixes(self, pose: ScanPose, fixes: Iterable[GnssFix]) -> Iterator[KeyscanFix]:
@@ -142,12 +145,11 @@ class DeferredScans:
     def __init__(self, config: LostConfig) -> None:
         self._config = config
         self._records: Deferred = []
-        self._gap_s = 0.0
+        self.gap_s = 0.0
         """Time before the first of them in which nothing shows the motion; 0: there was no gap."""
-        self._cabin = Cabin()
+        self.cabin = Cabin()
 
     def __len__(self) -> int:
-        """Number of deferred records."""
         return len(self._records)
 
     def follows_gap(self, before: LaserScan, scan: LaserScan, session: Session) -> bool:
@@ -155,26 +157,18 @@ class DeferredScans:
         is_unseen = not session.motion.model.is_measured and scan.stamp - before.stamp > LONGEST_GAP_S
         return is_unseen and self._config.doubted > 0.0 and session.newest is not None
 
-    def begin_gap(self, gap_s: float) -> None:
-        """Defer the scans from the next one on, as nothing shows the motion in the ``gap_s`` seconds before it."""
-        self._gap_s = gap_s
-
     def watch_cabin(self, scan: LaserScan, session: Session) -> None:
         """Follow the next scan in and out of a cabin, once something is known from before its door closed."""
         if session.lidar.settled_m < SETTLED_M:
-            self._cabin.leave()
+            self.cabin.leave()
         else:
-            self._cabin.add(scan)
-
-    def leave_cabin(self) -> None:
-        """Nothing is known any more from before the door of a cabin closed."""
-        self._cabin.leave()
+            self.cabin.add(scan)
 
     def is_doubtful(self, tracking: TrackingResult, session: Session) -> bool:
         """Whether a localized scan may show another place than those before it."""
-        if session.motion.may_be_frozen or self._gap_s:
+        if session.motion.may_be_frozen or self.gap_s:
             return True
-        return is_doubtful(tracking, session.lidar, self._config, self._cabin.is_leaving)
+        return is_doubtful(tracking, session.lidar, self._config, self.cabin.is_leaving)
 
     def add(self, record: LaserScan | CameraImage) -> None:
         """Defer a record as it is."""
@@ -186,29 +180,29 @@ class DeferredScans:
 
     def can_decide(self, session: Session) -> bool:
         """Whether there are enough scans to compare them with the map."""
-        travel_m, most = GAP_TRAVEL_M if self._gap_s else DOUBTFUL_TRAVEL_M, MOST_SCANS
-        if self._cabin.is_leaving:
+        travel_m, most = GAP_TRAVEL_M if self.gap_s else DOUBTFUL_TRAVEL_M, MOST_SCANS
+        if self.cabin.is_leaving:
             travel_m, most = LEAVING_M, LEAVING_SCANS
         return not session.motion.may_be_frozen and can_decide(self._scans, travel_m, most)
 
     @property
     def must_decide(self) -> bool:
         """Whether the scans are compared even if no more follow: only after a gap, if there are two."""
-        return self._gap_s > 0.0 and len(self._scans) > 1
+        return self.gap_s > 0.0 and len(self._scans) > 1
 
     def decide(self, session: Session) -> Outcome:
         """Compare the scans with the newest keyscans of the session; scans that are found elsewhere are moved there."""
         outcome = self._outcome(self._scans, session)
-        self._cabin.leave()
+        self.cabin.leave()
         return outcome
 
-    def begin_motion(self, second: LaserScan, session: Session) -> LaserScan:
+    def begin_motion(self, second: LaserScan, motion: PredictedMotion) -> LaserScan:
         """Give the first scan the motion that the second one shows; returns the second one, predicted from it."""
-        return session.motion.begin(self._records, second)
+        return motion.begin(self._records, second)
 
     def take(self) -> Deferred:
         """End the deferral; returns the records."""
-        records, self._records, self._gap_s = self._records, [], 0.0
+        records, self._records, self.gap_s = self._records, [], 0.0
         return records
 
     @property
@@ -216,9 +210,10 @@ class DeferredScans:
         return [record for record in self._records if isinstance(record, LaserScan)]
 
     def _outcome(self, scans: list[LaserScan], session: Session) -> Outcome:
-        lidar, gap_s = session.lidar, self._gap_s
-        if self._cabin.is_leaving and not gap_s:
-            return Outcome.OTHER_FLOOR if is_lost(scans, lidar, self._cabin.closed_s) else Outcome.SAME_PLACE
+        lidar, gap_s = session.lidar, self.gap_s
+        if self.cabin.is_leaving and not gap_s:
+            return Outcome.OTHER_FLOOR if is_lost(scans, lidar, self.cabin.closed_s) else Outcome.SAME_PLACE
         if not gap_s and is_lost(scans, lidar):
             return Outcome.SAME_PLACE_OTHER_MAP if session.drove_on(scans) else Outcome.OTHER_PLACE
-        return Outcome.SAME_PLACE if session.motion.relocate(self._records, lidar, gap_s) else Outcome.OTHER_PLACE
+        is_same = isinstance(session.motion, WheelOdometry) or session.motion.relocate(self._records, lidar, gap_s)
+        return Outcome.SAME_PLACE if is_same else Outcome.OTHER_PLACE

@@ -7,9 +7,7 @@ from dataclasses import replace
 
 from fcslam.geometry import se2
 from fcslam.lidar.first_motion import LONGEST_GAP_S
-from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.odometry import WHEELS
-from fcslam.lidar.tracker import TrackedScan, TrackingResult
 from fcslam.records import CameraImage, FloatArray, LaserScan, frozen
 from fcslam.sources.contradictions import WheelCheck
 
@@ -83,29 +81,6 @@ class WheelOdometry:
     def may_be_frozen(self) -> bool:
         """Whether the odometry stands still although the newest scans have changed."""
         return self.check.may_be_frozen
-
-    def awaits_second(self, _: LaserScan) -> bool:
-        """Whether only a second scan shows the motion during this one: never."""
-        return False
-
-    def begin(self, _: object, second: LaserScan) -> LaserScan:
-        """The second scan as it is."""
-        return second
-
-    def track(self, scan: LaserScan, frontend: LidarFrontend, *_: object) -> tuple[LaserScan, TrackingResult]:
-        """Localize a scan, whose motion was measured."""
-        return scan, frontend.localize(scan)
-
-    def observe(self, stamp: float, T_odom_base: FloatArray, tracked: TrackedScan) -> None:
-        """The motion does not depend on where a scan was found."""
-
-    def follow(self, _: object, scan: LaserScan, *__: object) -> LaserScan:
-        """A doubtful scan as it is."""
-        return scan
-
-    def relocate(self, *_: object) -> bool:
-        """Doubtful scans that do not contradict the map show the place before them."""
-        return True
 
     def place_image(self, image: CameraImage) -> CameraImage:
         """An image taken since the last scan, with its odometry in the same frame."""

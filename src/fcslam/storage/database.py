@@ -43,9 +43,6 @@ class Database(RowStore):
             exclusive: no other process may open the file; no transaction waits for the disk, and a loss of power may
                 take the last ones.
             is_checked: ``check_file`` passed the file just now.
-
-        Raises:
-            StoreError: the file is damaged, was made by something else, or cannot be used.
         """
         super().__init__()
         self._path = path

@@ -126,7 +126,6 @@ class Postgres:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Raise errors of the driver as a ``StoreError`` of one line."""
         import psycopg
 
         try:

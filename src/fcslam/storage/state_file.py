@@ -42,11 +42,7 @@ def write_state(path: Path, fits: str, state: State) -> None:
 
 
 def read_state(path: Path, fits: str) -> State | None:
-    """Read a state; None if there is no file.
-
-    Raises:
-        InputError: the file cannot be read, is damaged, or does not fit.
-    """
+    """Read a state; None if there is no file, an ``InputError`` if it cannot be read, is damaged or does not fit."""
     try:
         data = read_bytes(path)
         if _hash(data[_HASH_BYTES:]) != data[:_HASH_BYTES]:
