@@ -69,7 +69,6 @@ def parse(kind: type[SettingsType], content: dict[str, Any], where: str) -> Sett
 
 
 def _refusal(kind: type[Settings], error: ValidationError, where: str) -> InputError:
-    """One line about the first fault that pydantic found in ``kind``."""
     first = error.errors()[0]
     key = one_line(".".join(str(part) for part in first["loc"]))
     if first["type"] == "extra_forbidden":

@@ -116,12 +116,8 @@ def run_module(module: str, *arguments: str, timeout_s: float) -> tuple[int, str
 def worker_pool(niceness: int = 0, is_copy: bool = False) -> Executor:
     """An executor with one worker, another process, which ignores SIGTERM: service managers send it to both.
 
-    Args:
-        niceness: increment of the worker's niceness.
-        is_copy: the worker is a copy of this process when it begins its first task, where copies are safe.
-
-    Raises:
-        InputError: the host gives processes no semaphores.
+    ``is_copy``: the worker is a copy of this process when it begins its first task, where copies are safe. A host that
+    gives processes no semaphores is an ``InputError``.
     """
     context = _copying() if is_copy else multiprocessing.get_context("spawn")
     with _needing_semaphores():

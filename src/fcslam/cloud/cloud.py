@@ -43,12 +43,7 @@ class Cloud(FleetHost):
         return [encode(reply) for reply in self.apply(decode(data))]
 
     def apply(self, packet: Packet) -> list[Packet]:
-        """Apply a packet as it was received, and those that waited for it; returns the replies to its sender.
-
-        Raises:
-            PacketError: the packet does not fit what its robot sent before; then it has no effect and its number is
-                used up.
-        """
+        """Apply a packet as it was received, and those that waited for it; returns the replies to its sender."""
         number = PacketNumber(in_session(packet).robot, packet.sequence)
         if number not in self.log:
             self._packets[number], self._times[number] = packet, packet.time

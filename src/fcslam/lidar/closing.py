@@ -158,7 +158,6 @@ class LoopCloser:
         return self._accept(found, self._recognized(later, anchors, paths), anchors)
 
     def _forget_surplus(self, anchors: FloatArray) -> bool:
-        """Forget the oldest submaps around the newest one beyond the limit; returns whether there were any."""
         held = np.array(list(self._held))
         surplus = surplus_places(anchors[held, :2], NEARBY_M, MOST_NEARBY)
         for row in surplus:

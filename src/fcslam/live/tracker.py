@@ -146,7 +146,6 @@ class LiveTracker(ABC):
         return self._frontend.process(record)
 
     def _odometry(self, given: ArrayLike | None) -> FloatArray:
-        """The given odometry, or NaN without; the first scan decides whether there is any."""
         if self._pose is not None and (given is None) is not (self._pose.T_odom_base is None):
             raise InputError(
                 f"{self.name}: some scans have odometry and some have not; give it with every scan or with none"

@@ -178,7 +178,6 @@ class RobotFrontend:
         return self._session.place(scan, self._before)
 
     def _begin_without_odometry(self) -> None:
-        """Begin a session whose motion is predicted, with the scans at which the odometry was frozen."""
         self._motion, held = PredictedMotion(), []
         if self.odometry.check.may_be_frozen:
             self.scan_poses.cut(self.odometry.check.certain_s)
@@ -196,7 +195,7 @@ class RobotFrontend:
             if not self._deferred:
                 self._await_second(scan)
                 return
-            scan = self._deferred.begin_motion(scan, motion)
+            scan = motion.begin(self._deferred.records, scan)
             self._map_deferred()
         scan = self._bridge_gap(scan)
         self._deferred.watch_cabin(scan, self._session)
@@ -230,7 +229,7 @@ class RobotFrontend:
         return scan
 
     def _defer(self, scan: LaserScan, tracking: TrackingResult) -> None:
-        self._deferred.add_doubtful(scan, tracking, self._session)
+        self._deferred.add(self._session.follow(self._deferred.records, scan, tracking))
         pose = self._session.lidar.scan_pose(scan.stamp, tracking.tracked)
         self.newest = NewestScan(pose, tracking.tracked, tracking.quality, is_deferred=True)
         if self._deferred.can_decide(self._session):

@@ -103,12 +103,7 @@ class KeyframeFolder:
 
 
 def read_keyframes(folder: Path, most: int) -> list[KeptKeyframe]:
-    """The newest keyframes whose poses are known, by session and keyscan; a file that is damaged is left out.
-
-    Args:
-        folder: written by a ``KeyframeFolder``, perhaps at this moment.
-        most: largest number of keyframes.
-    """
+    """The ``most`` newest keyframes whose poses are known, by session and keyscan; a damaged file is left out."""
     numbers = sorted(
         tuple(map(int, path.stem.split("-"))) for path in folder.glob(f"*{_SUFFIX}") if not path.stem.endswith(_POSES)
     )

@@ -162,7 +162,6 @@ class MapLocalizer:
         self._publish(keyscan)
 
     def _predict(self, T_map_base: FloatArray, before: MappedKeyscan, keyscan: MappedKeyscan) -> FloatArray:
-        """The pose moved with the robot; the covariance grows by that of the motion."""
         predicted = se2.compose(T_map_base, se2.between(before.T_local_base, keyscan.T_local_base))
         dx, dy = predicted[:2] - T_map_base[:2]
         lever = np.array(((1.0, 0.0, -dy), (0.0, 1.0, dx), (0.0, 0.0, 1.0)))

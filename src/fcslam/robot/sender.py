@@ -86,12 +86,7 @@ class Sender:
             self.failure = error
 
     def step(self) -> float:
-        """Send at most one batch and read the reply; returns the time until the next step, seconds.
-
-        Raises:
-            CloudError: the cloud rejects the robot.
-            InputError: the outbox or its folder cannot be used, or the cloud lacks the beginning of this epoch.
-        """
+        """Send at most one batch and read the reply; returns the time until the next step, seconds."""
         try:
             return self._step()
         except UnavailableError as error:

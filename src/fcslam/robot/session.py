@@ -144,13 +144,13 @@ class DeferredScans:
 
     def __init__(self, config: LostConfig) -> None:
         self._config = config
-        self._records: Deferred = []
+        self.records: Deferred = []
         self.gap_s = 0.0
         """Time before the first of them in which nothing shows the motion; 0: there was no gap."""
         self.cabin = Cabin()
 
     def __len__(self) -> int:
-        return len(self._records)
+        return len(self.records)
 
     def follows_gap(self, before: LaserScan, scan: LaserScan, session: Session) -> bool:
         """Whether nothing shows the motion between two scans, and there is a map in which to look for the later one."""
@@ -172,11 +172,7 @@ class DeferredScans:
 
     def add(self, record: LaserScan | CameraImage) -> None:
         """Defer a record as it is."""
-        self._records.append(record)
-
-    def add_doubtful(self, scan: LaserScan, tracking: TrackingResult, session: Session) -> None:
-        """Defer a doubtful scan, with its motion since those before it."""
-        self.add(session.follow(self._records, scan, tracking))
+        self.records.append(record)
 
     def can_decide(self, session: Session) -> bool:
         """Whether there are enough scans to compare them with the map."""
@@ -196,18 +192,14 @@ class DeferredScans:
         self.cabin.leave()
         return outcome
 
-    def begin_motion(self, second: LaserScan, motion: PredictedMotion) -> LaserScan:
-        """Give the first scan the motion that the second one shows; returns the second one, predicted from it."""
-        return motion.begin(self._records, second)
-
     def take(self) -> Deferred:
         """End the deferral; returns the records."""
-        records, self._records, self.gap_s = self._records, [], 0.0
+        records, self.records, self.gap_s = self.records, [], 0.0
         return records
 
     @property
     def _scans(self) -> list[LaserScan]:
-        return [record for record in self._records if isinstance(record, LaserScan)]
+        return [record for record in self.records if isinstance(record, LaserScan)]
 
     def _outcome(self, scans: list[LaserScan], session: Session) -> Outcome:
         lidar, gap_s = session.lidar, self.gap_s
@@ -215,5 +207,5 @@ class DeferredScans:
             return Outcome.OTHER_FLOOR if is_lost(scans, lidar, self.cabin.closed_s) else Outcome.SAME_PLACE
         if not gap_s and is_lost(scans, lidar):
             return Outcome.SAME_PLACE_OTHER_MAP if session.drove_on(scans) else Outcome.OTHER_PLACE
-        is_same = isinstance(session.motion, WheelOdometry) or session.motion.relocate(self._records, lidar, gap_s)
+        is_same = isinstance(session.motion, WheelOdometry) or session.motion.relocate(self.records, lidar, gap_s)
         return Outcome.SAME_PLACE if is_same else Outcome.OTHER_PLACE

@@ -62,10 +62,7 @@ class TagDetector:
     def find(self, image: CameraImage, keyscan: KeyscanId, T_keyscan_image: FloatArray) -> Iterator[TagSighting]:
         """The tags of an image whose pose is unambiguous, each number at most once.
 
-        Args:
-            image: the image.
-            keyscan: the keyscan that they are seen from.
-            T_keyscan_image: pose of the base at the time of the image in the keyscan's base, shape (3,).
+        ``T_keyscan_image`` is the pose of the base at the time of the image in the keyscan's base, shape (3,).
         """
         picture = decode_grey(image.encoded)
         if picture is None or picture.shape != (image.camera.height, image.camera.width):

@@ -34,15 +34,10 @@ class Database(RowStore):
     def __init__(
         self, path: Path, schema: str, version: int, *, exclusive: bool = False, is_checked: bool = False
     ) -> None:
-        """Open the file, or create it with ``schema``.
+        """Open the file, or create it by the statements of ``schema``.
 
-        Args:
-            path: the file.
-            schema: SQL statements that make its tables.
-            version: version of the schema.
-            exclusive: no other process may open the file; no transaction waits for the disk, and a loss of power may
-                take the last ones.
-            is_checked: ``check_file`` passed the file just now.
+        ``exclusive``: no other process may open the file; no transaction waits for the disk, and a loss of power may
+        take the last ones. ``is_checked``: ``check_file`` passed the file just now.
         """
         super().__init__()
         self._path = path
@@ -158,7 +153,6 @@ def _check(path: Path, connection: sqlite3.Connection, schema: str, version: int
 
 
 def _check_content(connection: sqlite3.Connection) -> None:
-    """Read all of a database; what is damaged is a DatabaseError."""
     (found,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
     if found != "ok":
         raise sqlite3.DatabaseError(found)

@@ -12,13 +12,7 @@ from pathlib import Path
 
 
 def write_file(path: Path, content: bytes | memoryview | str, *, private: bool = False) -> None:
-    """Replace a file atomically.
-
-    Args:
-        path: the file; its folder exists.
-        content: what it holds afterwards; text is encoded as UTF-8.
-        private: only the owner may read it, from the first moment.
-    """
+    """Replace a file atomically; ``private``: only the owner may read it, from the first moment."""
     data = content.encode() if isinstance(content, str) else content
     with replacing(path) as unfinished:
         mode = 0o600 if private else 0o666

@@ -37,12 +37,7 @@ class Postgres:
     """
 
     def __init__(self, url: str, name: str) -> None:
-        """Look for the server.
-
-        Args:
-            url: postgresql://USER@HOST:PORT/DATABASE without a password (``take_password``).
-            name: of this process, for those who look at the server.
-        """
+        """Look for the server at a URL without a password (``take_password``); it shows ``name`` for this process."""
         self.url = _checked(url)
         self._name = name
         self._idle: list[_Connection] = []
@@ -59,10 +54,9 @@ class Postgres:
 
     @contextmanager
     def connection(self, begin: str) -> Iterator["_Connection"]:
-        """Use a connection alone; what is not committed at the end of the block is undone.
+        """Use a connection alone after the statement ``begin``; what is not committed at the end is undone.
 
-        Args:
-            begin: a statement that is executed first. If the connection turns out to be lost, another one is made.
+        If the connection turns out to be lost at ``begin``, another one is made.
         """
         with self._places, self._translated():
             connection = self._begun(begin)
