@@ -34,10 +34,10 @@ from fcslam.learning.federated.client import Answer, InProcessFleet
 from fcslam.learning.federated.coordinator import Coordinator, CoordinatorHooks, RoundRules, TrainingFleet
 from fcslam.learning.federated.evaluation import PUBLIC_IMAGES
 from fcslam.learning.federated.fleet_grid import FleetGrid
-from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
 from fcslam.learning.federated.fleet_server import listening
 from fcslam.learning.federated.initial_weights import read_detector_weights
 from fcslam.learning.federated.messages import TrainingRequest
+from fcslam.learning.federated.robot_learning import RobotLink, serve_requests
 from fcslam.learning.federated.rounds import RoundReport
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights

@@ -22,8 +22,8 @@ import numpy as np
 from worlds.yard import Yard
 
 import fcslam
+from fcslam.cli.play import PlaybackPace
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
-from fcslam.live.playback import PlaybackPace
 from fcslam.live.robot import LARGEST_BACKLOG
 from fcslam.records import LaserScan
 from fcslam.robot.backend_runner import backend_process

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.features.classical import positions_and_responses, ranked
+from fcslam.features.dense import box_nms
 from fcslam.features.detector import GreyImage, Keypoints, OnnxDetector
-from fcslam.features.nms import box_nms
 from fcslam.records import FloatArray, frozen
 
 _CORNERS: Final = 600

@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 
 from fcslam.errors import writing
+from fcslam.features.dense import box_nms
 from fcslam.features.detector import ImageFeatures, Keypoints
-from fcslam.features.nms import box_nms
 from fcslam.learning.homography import (
     Repeatability,
     Rows,

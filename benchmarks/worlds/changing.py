@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from fcslam.lab.simulation.floorplan import DOOR_M, FloorPlan, Piece, PieceKind, move_furniture, segments_of
-from fcslam.lab.simulation.simulated_fleet import SimulatedRobot
-from fcslam.lab.simulation.world import World
+from fcslam.lab.simulation.simulated_fleet import SimulatedRobot, World
 from fcslam.records import FloatArray
 
 _DRIVEN_BY_M = 4.0

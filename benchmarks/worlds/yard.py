@@ -22,7 +22,7 @@ from fcslam.lab.simulation.floorplan import (
     segments_of,
 )
 from fcslam.lab.simulation.layouts import Lane
-from fcslam.lab.simulation.world import World
+from fcslam.lab.simulation.simulated_fleet import World
 from fcslam.records import FloatArray, frozen
 
 from .outdoor_rays import OutdoorRayCaster

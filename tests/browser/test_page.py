@@ -22,8 +22,7 @@ from fcslam.cli import main
 from fcslam.maps.occupancy_map import parse_map
 from fcslam.maps.palette import APPEARED, FLOOR, ROBOTS, WALL
 from fcslam.page import ASSETS
-from fcslam.page.report import report_html
-from fcslam.page.shown_run import ShownRun
+from fcslam.page.report import ShownRun, report_html
 from tests.cli.test_serve import API, Service, send
 from tests.mission.test_map_changes import write_run
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.graph.clique import maximum_clique
-from fcslam.graph.cluster import count_separate_places, dominant_cluster, relative_frame
+from fcslam.graph.cluster import count_separate_places, dominant_cluster, maximum_clique, relative_frame
 from fcslam.graph.consistency import (
     Closures,
     count_supporting_closures,

@@ -6,10 +6,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from fcslam.cli.play import PlaybackPace, play_records
 from fcslam.errors import CloudError, InputError
 from fcslam.features.detector_file import describe_detector_file
 from fcslam.geometry import se2
-from fcslam.live.playback import PlaybackPace, play
 from fcslam.live.records import EventKind, LocalizationState, Wiring
 from fcslam.live.robot import Robot
 from fcslam.maps.occupancy_map import Occupancy
@@ -70,7 +70,7 @@ def drive(tmp_path, network, records, resume=False, watch=lambda _: None, record
         ),
     )  # fmt: skip
     with closing(robot):
-        play(robot, records, AS_FAST_AS_POSSIBLE, watch)
+        play_records(robot, records, AS_FAST_AS_POSSIBLE, watch)
         return robot
 
 

@@ -15,8 +15,8 @@ from fcslam.errors import CloudError, InputError, SourceError
 from fcslam.live.served_map import fetch_maps
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_stem, map_yaml, pgm_bytes
 from fcslam.mission.localization import read_map
+from fcslam.page.report import ShownRun
 from fcslam.page.routes import run_page
-from fcslam.page.shown_run import ShownRun
 from fcslam.runs import RobotTrajectory, Run
 from fcslam.wire.fleet_client import MapClient
 from fcslam.wire.http_transport import Server

@@ -23,9 +23,8 @@ from fcslam.errors import InputError
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.mission.mission_file import as_stored, mission_bytes
 from fcslam.page import ASSETS, MODULES
-from fcslam.page.report import MOST_TILES, report_html
+from fcslam.page.report import MOST_TILES, ShownRun, report_html
 from fcslam.page.routes import run_page
-from fcslam.page.shown_run import ShownRun
 from fcslam.records import Channel, ClosureStatus, Edit, Reason, ReasonCode, Veto
 from fcslam.runs import ClosureRow, Join, Metric, RobotTrajectory, Run
 from fcslam.service.http.app import PREFIX

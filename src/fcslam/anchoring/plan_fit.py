@@ -6,8 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from fcslam.anchoring.alignment import LEAST_SHARE
-from fcslam.anchoring.lengths import lengths_in_plan
+from fcslam.anchoring.alignment import LEAST_SHARE, lengths_in_plan
 from fcslam.anchoring.part import ROUNDS, MapPart
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.cloud.result import MappedRobot

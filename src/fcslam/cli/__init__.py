@@ -1,4 +1,4 @@
-"""The command line: one module for each command. Commands import what they need when they run, so help is quick."""
+"""The command line: a module for each command, and one for small ones. Commands import what they need when they run."""
 
 import errno
 import io
@@ -13,21 +13,18 @@ import typer
 
 import fcslam
 from fcslam.cli import (
-    certificates,
-    config,
     demo,
     edit,
     evaluate,
-    extract,
     federate,
     info,
     record,
     serve,
     show,
     simulate,
+    small_commands,
     train,
 )
-from fcslam.cli import changes as changed
 from fcslam.cli import localize as localization
 from fcslam.cli import map as mapping
 from fcslam.cli import play as playback
@@ -76,13 +73,13 @@ COMMANDS: dict[str, tuple[str, Callable[..., None] | typer.Typer]] = {
     "evaluate": (STUDY, evaluate.app),
     "tools": (STUDY, tools),
     "tools simulate": (RECORDINGS, simulate.simulate),
-    "tools changes": (RECORDINGS, changed.changes),
-    "tools config": (SETUP, config.config),
-    "tools certificates": (SETUP, certificates.certificates),
+    "tools changes": (RECORDINGS, small_commands.changes),
+    "tools config": (SETUP, small_commands.config),
+    "tools certificates": (SETUP, small_commands.certificates),
     "tools warm-up": (SETUP, warming.warm_up),
     "tools train": (LEARNING, train.train),
     "tools federate": (LEARNING, federate.federate),
-    "tools extract": (LEARNING, extract.extract),
+    "tools extract": (LEARNING, small_commands.extract),
 }
 """Group in the help, and function, of each command. A typer has commands and examples of its own."""
 EXAMPLES = """\

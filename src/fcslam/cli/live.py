@@ -132,8 +132,8 @@ def standstill_learning(
     learning: "LearningProcess | None", robot: "Robot | LocalizedRobot"
 ) -> "Iterator[Callable[[RobotPose], None]]":
     """Let a process learn while its robot stands still, if there is one; gives what follows the robot's poses."""
+    from fcslam.learning.federated.learning_process import Standstill
     from fcslam.live.localized_robot import LocalizedRobot
-    from fcslam.live.standstill import Standstill
 
     if learning is None or isinstance(robot, LocalizedRobot):
         yield lambda _pose: None

@@ -213,7 +213,7 @@ def _report(
     from rich.table import Table
 
     from fcslam.anchoring.anchors import anchoring_lines
-    from fcslam.metrics.jumps import find_jumps
+    from fcslam.metrics.trajectory import find_jumps
 
     values = {name: metric.value for name, metric in run.metrics.items()}
     has_floors = any(trajectory.floor for trajectory in run.trajectories.values())

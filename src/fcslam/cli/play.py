@@ -2,7 +2,7 @@
 
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.live.records import RobotStatus
     from fcslam.live.robot import Robot
+    from fcslam.records import SensorRecord
     from fcslam.robot.frontend import RobotConfig
     from fcslam.sources import Survey
 
@@ -67,8 +68,6 @@ def play(
     """Map a recording, and send its places and keyscans to the cloud, through outages and restarts."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.cloud.sessions import check_robot
-    from fcslam.live.playback import PlaybackPace
-    from fcslam.live.playback import play as play_records
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
     from fcslam.sources.faults import Fault
@@ -227,3 +226,48 @@ def _report(robot: "Robot", state: Path, server: str) -> None:
         trajectory = robot.trajectory()
         write_tum(state / "trajectory.tum", trajectory.stamps, trajectory.T_map_base)
         typer.echo(f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}")
+
+
+class PlaybackPace:
+    """Paces a recording by its own clock."""
+
+    def __init__(self, speed: float | None, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
+        """``speed``: factor of the recorded speed; None: as fast as the robot can map."""
+        self._speed = speed
+        self._clock = clock
+        self._sleep = sleep
+        self._origin: tuple[float, float] | None = None
+        """The first stamp, and the time of the clock at which it was due."""
+
+    def wait(self, stamp: float) -> None:
+        """Sleep until ``stamp`` is due; the first stamp is due at once."""
+        if self._speed is None:
+            return
+        if self._origin is None:
+            self._origin = stamp, self._clock()
+        due = self._origin[1] + (stamp - self._origin[0]) / self._speed
+        self._sleep(max(0.0, due - self._clock()))
+
+
+def play_records(
+    robot: "Robot",
+    records: "Iterable[SensorRecord]",
+    pace: PlaybackPace,
+    watch: "Callable[[RobotStatus], None]",
+    stay: "Callable[[Robot], None] | None" = None,
+) -> None:
+    """Map a whole recording and send all packets; what a resumed robot did before is not paced.
+
+    ``stay`` is called after the last record, before the recording ends.
+    """
+    from fcslam.records import LaserScan
+
+    for record in records:
+        if isinstance(record, LaserScan) and not robot.status().is_catching_up:
+            pace.wait(record.stamp)
+        robot.add(record)
+        robot.wait_for_room(watch)
+        watch(robot.status())
+    if stay is not None:
+        stay(robot)
+    robot.finish(watch=watch)

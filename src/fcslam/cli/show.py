@@ -36,8 +36,7 @@ def show(
     force: Force = False,
 ) -> None:
     """Show a finished run in the browser, read-only; Ctrl-C ends it."""
-    from fcslam.page.report import report_html
-    from fcslam.page.shown_run import ShownRun
+    from fcslam.page.report import ShownRun, report_html
     from fcslam.storage.files import write_file
 
     if html is not None and html.exists() and not (force and html.is_file()):

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from fcslam.geometry import se2
 from fcslam.graph.factors import FactorCache, Loss
 from fcslam.graph.optimizer import optimize
-from fcslam.graph.pose_graph import Edge, EdgeArrays, PoseGraph
-from fcslam.graph.rows import Rows
+from fcslam.graph.pose_graph import Edge, EdgeArrays, PoseGraph, Rows
 from fcslam.graph.trajectory import Trajectory, build_trajectory
 from fcslam.records import Constraint, FloatArray, KeyscanId
 from fcslam.storage.state_file import State

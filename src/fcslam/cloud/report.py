@@ -15,9 +15,9 @@ from fcslam.geometry import se2
 from fcslam.graph.evidence import ClusterEvidence
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.maps.drawing import picture
 from fcslam.maps.fusion import fuse
 from fcslam.maps.occupancy_map import OccupancyMap, map_stem, map_yaml, pgm_bytes, server_files
-from fcslam.maps.run_pictures import picture, quality_files
 from fcslam.processes import trim_memory
 from fcslam.records import PLACE_CHANNELS, ClosureStatus, FloatArray, LoopClosure, frozen
 from fcslam.runs import ClosureRow, Join, LocalMap, Metric, RobotTrajectory, Run
@@ -89,7 +89,7 @@ def run_of(
         pose_graph_g2o=g2o_text(result.graph, _ids([mapped[name] for name in sorted(tracks)])),
         map_files=map_files,
         local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
-        quality=quality_files(certificates, fused),
+        quality=_quality(certificates, fused),
     )
 
 
@@ -198,6 +198,14 @@ def _certificates(result: FleetResult, maps: Mapping[int, OccupancyMap]) -> dict
             paths = [MappedPath(robot.robot, robot.stamps, robot.T_map_base, robot.variables) for robot in members]
             certificates[k] = certify(result.graph, paths, fused)
     return certificates
+
+
+def _quality(certificates: Mapping[int, Mapping[str, Any]], maps: Mapping[int, OccupancyMap]) -> dict[str, bytes]:
+    if not certificates:
+        return {}
+    from fcslam.maps.certificate import quality_files
+
+    return quality_files(certificates, maps)
 
 
 def fused_maps(result: FleetResult, grid: OccupancyConfig) -> Iterator[tuple[int, OccupancyMap]]:

@@ -2,16 +2,20 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fcslam.compiled import njit
 from fcslam.geometry import se2
-from fcslam.graph.rows import Rows
 from fcslam.records import FloatArray, frozen
 
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+_SPARE = 8
+"""A full array grows by 1 / 8 of its rows: appending stays cheap, and little memory is unused."""
+_LEAST = 2 * _SPARE
 MAXIMUM_INFORMATION = 1e8
 """Largest eigenvalue of an information matrix, 0.1 mm or 0.1 mrad: stiffer edges make the systems ill-conditioned."""
 
@@ -25,6 +29,35 @@ PROBABILITY = 0.99
 """Probability with which the error of a true closure passes the chi-square test."""
 CHI2_LIMIT = 11.344866730144373
 """Chi-square of a motion, with its three degrees of freedom, for this probability."""
+
+
+class Rows(Generic[Scalar]):
+    """Rows of one shape and type; each can be replaced, none removed."""
+
+    __slots__ = "_array", "_count"
+
+    def __init__(self, rows: NDArray[Scalar]) -> None:
+        """Start with a copy of ``rows``, shape (N, ...); N may be 0."""
+        self._array, self._count = rows.copy(), len(rows)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def values(self) -> NDArray[Scalar]:
+        """The rows so far, shape (N, ...): a view, in which later changes of these rows may or may not show."""
+        return self._array[: self._count]
+
+    def append(self, row: ArrayLike) -> int:
+        """Append a row; returns its number."""
+        if self._count == len(self._array):
+            more = max(self._count // _SPARE, _LEAST)
+            grown: NDArray[Any] = np.empty((self._count + more, *self._array.shape[1:]), self._array.dtype)
+            grown[: self._count] = self._array
+            self._array = grown
+        self._array[self._count] = row
+        self._count += 1
+        return self._count - 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,6 +25,7 @@ from fcslam.graph.pose_graph import PoseGraph
 from fcslam.lidar.verification import CLOSURE_SIGMA_M
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, pixels_of
 from fcslam.records import FloatArray
+from fcslam.runs import QUALITY
 
 SCALE: Final = 0.25
 """Ratio of true errors to the standard deviations of the graph."""
@@ -244,6 +245,15 @@ def certificate_png(certificate: Mapping[str, Any], occupancy: OccupancyMap) -> 
         free = occupancy.cells[max(row, 0) : row + side, max(column, 0) : column + side] == Occupancy.FREE
         part[free] = (0.5 * part[free] + 0.5 * np.array((60.0, 220.0 * (1.0 - bad), 220.0 * bad))).astype(np.uint8)
     return bytes(cv2.imencode(".png", picture[::-1])[1])
+
+
+def quality_files(certificates: Mapping[int, Mapping[str, Any]], maps: Mapping[int, OccupancyMap]) -> dict[str, bytes]:
+    """``quality.json``, and a picture of each map that has a certificate."""
+    pictures = {
+        f"{QUALITY}_{k}.png" if k else f"{QUALITY}.png": certificate_png(one, maps[k])
+        for k, one in certificates.items()
+    }
+    return {f"{QUALITY}.json": certificate_json(certificates), **pictures}
 
 
 def _information(graph: PoseGraph, poses: FloatArray, rows: NDArray[np.int64]) -> csc_array:

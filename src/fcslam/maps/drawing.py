@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fcslam.geometry import se2
 from fcslam.maps import palette
 from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap
-from fcslam.records import Channel, FloatArray
+from fcslam.records import Channel, ClosureStatus, FloatArray, LoopClosure
 
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
@@ -96,6 +96,24 @@ def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closure
         labels.append((f"{len(closures)} closure{'s' * (len(closures) > 1)} between robots", CLOSURE))
     picture = np.vstack((canvas, _legend(labels, canvas.shape[1], view.cell_px / view.cell_m)))
     return bytes(cv2.imencode(".png", picture)[1])
+
+
+def picture(
+    occupancy: OccupancyMap,
+    trajectories: Mapping[str, FloatArray],
+    closures: Sequence[LoopClosure],
+    keyscans: Mapping[str, FloatArray],
+) -> bytes:
+    """The map with trajectories (N, 3) by session, and a line for each accepted closure between robots.
+
+    ``keyscans`` are poses (K, 3) by session; closures with an end outside of the map are left out.
+    """
+    lines = [
+        np.array((keyscans[i.robot][i.number, :2], keyscans[j.robot][j.number, :2]))
+        for i, j in ((closure.i, closure.j) for closure in closures if closure.status is ClosureStatus.ACCEPTED)
+        if i.robot != j.robot and i.robot in keyscans and j.robot in keyscans
+    ]
+    return map_png(occupancy, trajectories, lines)
 
 
 def highlighted_png(

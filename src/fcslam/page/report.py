@@ -1,4 +1,7 @@
-"""The page over a finished run as one file: it holds what the service answers to the page, and asks nobody."""
+"""A finished run as viewers see it, and the page over it as one file.
+
+The file holds what the service answers to the page, and asks nobody.
+"""
 
 import base64
 import gzip
@@ -7,26 +10,33 @@ import itertools
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 from urllib.parse import quote
 
 import httpx
 from fastapi import FastAPI
 from fastapi.params import Depends as Dependency
 
+from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.errors import InputError
 from fcslam.maps.occupancy_map import map_stem
 from fcslam.maps.tiles import WORLD_M
+from fcslam.mission.mission_file import opened_copy
 from fcslam.page import ASSETS, MODULES
 from fcslam.records import ClosureStatus
 from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES
+from fcslam.runs.folder import MISSION
 from fcslam.service.http.app import PREFIX, VIEWER_ROUTERS
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.problems import add_handlers
 from fcslam.service.http.state import EventStream
-from fcslam.service.viewed_mission import ViewedMission
+from fcslam.service.intake import SessionState
+from fcslam.service.viewed_mission import PacketCounts, ViewedMission, viewed_run
 
 MOST_CLOSURES = 5000
 """Largest number of closures of each status that the page asks for."""
@@ -36,6 +46,39 @@ _IMPORT = re.compile(r"^import (\{[^}]*\}) from \"\./(\w+)\.js\";\n", re.MULTILI
 _EXPORT = re.compile(r"^export ((?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
 SCRIPT, STYLE = '<script type="module" src="page.js"></script>', '<link rel="stylesheet" href="page.css">'
 """Elements of the page that the file holds instead."""
+
+
+class ShownRun:
+    """A ``ViewedMission`` that nobody can change. Any thread may call; its end removes its copy of the mission file."""
+
+    def __init__(self, folder: Path) -> None:
+        self.run_folder = folder.resolve()
+        self.name = self.run_folder.name
+        mission = folder / MISSION
+        self._copy = ExitStack()
+        self.store = self._copy.enter_context(opened_copy(mission if mission.is_file() else None))
+        """The run folder's mission file; without packets if it has none."""
+        self._packets = Counter((envelope.robot, envelope.epoch) for envelope in self.store.envelopes())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._copy.close()
+
+    def sessions(self, robot: str | None = None) -> list[SessionState]:
+        """Sessions of one robot or of all, by robot and epoch."""
+        known = sorted({*self._packets, *map(robot_and_epoch, viewed_run(self.run_folder).trajectories)})
+        return [SessionState(*session, self._packets[session]) for session in known if robot in (None, session[0])]
+
+    def last_heard_s(self, robot: str) -> float | None:  # noqa: ARG002
+        """None: no robot sends anything here."""
+        return None
+
+    def packet_counts(self) -> PacketCounts:
+        """All packets of a finished run took effect."""
+        count = self._packets.total()
+        return PacketCounts(count, count, 0)
 
 
 @dataclass(frozen=True, slots=True)

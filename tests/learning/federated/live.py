@@ -5,8 +5,8 @@ import socket
 import threading
 
 from fcslam.learning.federated.fleet_grid import FleetGrid
-from fcslam.learning.federated.fleet_robot import RobotLink, serve_requests
 from fcslam.learning.federated.fleet_server import listening
+from fcslam.learning.federated.robot_learning import RobotLink, serve_requests
 
 
 class _EndedError(Exception):

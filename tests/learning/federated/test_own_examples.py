@@ -14,8 +14,11 @@ from fcslam.learning.federated.client import RevisitClient  # noqa: E402
 from fcslam.learning.federated.held_out import judge  # noqa: E402
 from fcslam.learning.federated.initial_weights import read_detector_weights  # noqa: E402
 from fcslam.learning.federated.networks import weights_to_network  # noqa: E402
-from fcslam.learning.federated.own_examples import SPLIT_FILE, own_examples  # noqa: E402
-from fcslam.learning.federated.robot_learning import LearningRobot  # noqa: E402
+from fcslam.learning.federated.robot_learning import (  # noqa: E402
+    SPLIT_FILE,
+    LearningRobot,
+    own_examples,
+)
 from fcslam.records import Channel, Place  # noqa: E402
 from fcslam.robot.backend import RobotBackend  # noqa: E402
 from fcslam.robot.backend_runner import inline  # noqa: E402

@@ -18,7 +18,6 @@ from fcslam.errors import InputError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.maps.palette import ROBOTS
 from fcslam.records import Channel, Correction, Keyscan
-from fcslam.service.http import operations
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, VERSION
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
@@ -337,7 +336,7 @@ def test_the_service_is_ready_when_the_worker_has_caught_up(desk, monkeypatch):
     assert desk.ask("GET", "/readyz").json() == {"status": "ready", "backlog": 0}
     worker = desk.state.mission.worker
     notify, worker.notify = worker.notify, lambda: None
-    monkeypatch.setattr(operations, "LARGEST_BACKLOG", 5)
+    monkeypatch.setattr("fcslam.service.http.app.LARGEST_BACKLOG", 5)
     for count, status in ((5, 200), (6, 503)):
         desk.told(desk.send("a", A[:count]))
         answer = desk.ask("GET", "/readyz")

@@ -15,8 +15,7 @@ from fcslam.errors import InputError, StoreError
 from fcslam.records import Change, Undo
 from fcslam.service.detectors import LONGEST_FILE_BYTES
 from fcslam.service.http.authentication import Role
-from fcslam.service.http.events import LOOK_S
-from fcslam.service.http.fleet import edit_summary
+from fcslam.service.http.fleet import LOOK_S, edit_summary
 from fcslam.service.http.limits import json_body, read_body, read_json
 from fcslam.service.http.responses import DetectorSummary, EditSummary, Finalized, content, refusals
 from fcslam.service.http.robots import NETWORK

@@ -1,11 +1,12 @@
-"""Routes of viewers about the fleet: robots, closures, joins, edits and learning."""
+"""Routes of viewers about the fleet: robots, closures, joins, edits, learning, and the stream of events."""
 
+import asyncio
 import csv
 import json
 import math
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Annotated, Final
 
 from fastapi import APIRouter, Depends, HTTPException, Query, Request
 from fastapi import Path as PathParameter
-from fastapi.responses import Response
+from fastapi.responses import Response, StreamingResponse
 from pydantic import Field
 
 import fcslam
@@ -43,6 +44,12 @@ from fcslam.service.keyscans import live_pose, live_scan, overlay_png
 from fcslam.service.viewed_mission import ViewedMission, run_of
 from fcslam.wire.limits import MAXIMUM_EPOCH
 
+EVENTS = "text/event-stream"
+MOST_STREAMS = 200
+"""Streams at a time: each costs the process a look four times a second. A further one ends the oldest, whose client
+asks again if it is still there."""
+LOOK_S = 0.25
+"""How often something that waits looks again: a stream for events, a request for its result."""
 ROUNDS_FILE: Final = "rounds.csv"
 """In the output folder of `fcslam tools federate`."""
 _LOSS = "loss_"
@@ -258,3 +265,37 @@ def _round(row: Mapping[str, str]) -> LearningRound:
         losses={name.removeprefix(_LOSS): number for name, number in numbers.items() if name.startswith(_LOSS)},
         measures={name: number for name, number in numbers.items() if name in _MEASURES},
     )
+
+
+def event_router(state: ViewerState) -> APIRouter:
+    """One stream."""
+    router = APIRouter(tags=["viewers"], dependencies=state.require(*VIEWERS), responses=refusals(401, 403, 503))
+
+    streams: list[object] = []
+
+    async def lines(request: Request) -> AsyncIterator[str]:
+        mine, said, said_s = object(), dict[str, tuple[int, int]](), time.monotonic()
+        streams.append(mine)
+        del streams[:-MOST_STREAMS]
+        try:
+            while mine in streams and state.admits(request, *VIEWERS):
+                newest = state.events.newest()
+                news = [(kind, number) for kind, (_, number) in newest.items() if said.get(kind) != newest[kind]]
+                if news or time.monotonic() - said_s >= state.events.beat_s:
+                    said, said_s = newest, time.monotonic()
+                    told = [f"event: {kind}\ndata: {json.dumps({'number': number})}\n\n" for kind, number in news]
+                    yield "".join(told) or ": nothing new\n\n"
+                await asyncio.sleep(LOOK_S)
+        finally:
+            if mine in streams:
+                streams.remove(mine)
+
+    @router.get("/events", **file_of(EVENTS, refused=()))
+    async def get_events(request: Request) -> StreamingResponse:
+        """``live``: there is a new live run; ``finalized``: a result was written. A comment comes at least every 5 s.
+
+        The stream ends when the service stops, or when the token is no longer valid.
+        """
+        return StreamingResponse(lines(request), media_type=EVENTS)
+
+    return router

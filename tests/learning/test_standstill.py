@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fcslam.live.standstill import MOVED_M, STANDS_AFTER_S, Standstill
+from fcslam.learning.federated.learning_process import MOVED_M, STANDS_AFTER_S, Standstill
 
 
 def told(poses):
