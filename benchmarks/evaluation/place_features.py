@@ -147,8 +147,8 @@ def index_scores(index: PlaceIndex[int], described: DescribedSet) -> FloatArray:
 
     def ask(q: int) -> None:
         barred = {int(g) for g in np.flatnonzero(~admitted[q])}
-        for found in index.query(described.queries[q].descriptors, count, barred):
-            scores[q, found.id] = found.similarity
+        for place, similarity in index.query(described.queries[q].descriptors, count, barred):
+            scores[q, place] = similarity
 
     online = described.place_set.is_online
     for g, place in enumerate(described.gallery):

@@ -104,8 +104,7 @@ def test_a_room_moved_by_T_is_found_moved_by_T(angle):
     rng = np.random.default_rng(16)
     T_a_b = np.array([0.8, -0.6, angle])
     here = asymmetric_room(rng)
-    a, b = describe(se2.transform(T_a_b, here)), describe(here)
-    matches = mutual_matches(a.descriptors, b.descriptors, max_distance=60)
-    motion, inliers = rigid_hypotheses(a.keypoints_m, b.keypoints_m, matches)[0]
+    (keypoints_a, a), (keypoints_b, b) = describe(se2.transform(T_a_b, here)), describe(here)
+    motion, inliers = rigid_hypotheses(keypoints_a, keypoints_b, mutual_matches(a, b, max_distance=60))[0]
     assert_close(motion, T_a_b, metres=0.06, radians=0.01)
     assert len(inliers) >= 25

@@ -144,10 +144,8 @@ def test_any_order_of_adding_and_forgetting_leaves_what_a_fresh_description_give
 @BOTH
 def test_a_stored_place_is_found_first_and_wholly_like_itself(strategy, scoring):
     index, places = filled(strategy, scoring, beam=1)
-    best = index.query(places[17], top_k=1)[0]
-    assert best.id == 17
-    assert best.similarity == pytest.approx(1.0)
-    assert all(0.0 < found.similarity <= 1.0 + 1e-9 for found in index.query(places[17], top_k=1000))
+    assert index.query(places[17], top_k=1) == [(17, pytest.approx(1.0))]
+    assert all(0.0 < similarity <= 1.0 + 1e-9 for _, similarity in index.query(places[17], top_k=1000))
 
 
 @EVERY
@@ -155,7 +153,7 @@ def test_of_equals_the_one_stored_first_comes_first(strategy):
     index, places = filled(strategy)
     for twin in (200, 100):
         index.add(twin, places[9])
-    assert [found.id for found in index.query(places[9], top_k=3)] == [9, 200, 100]
+    assert [stored for stored, _ in index.query(places[9], top_k=3)] == [9, 200, 100]
 
 
 @EVERY
@@ -163,8 +161,8 @@ def test_of_equals_the_one_stored_first_comes_first(strategy):
 def test_excluded_places_make_room_for_the_next(strategy, scoring):
     index, places = filled(strategy, scoring)
     everything = index.query(places[3], top_k=1000)
-    excluded = {found.id for found in everything[:30:2]}
-    expected = [found for found in everything if found.id not in excluded]
+    excluded = {stored for stored, _ in everything[:30:2]}
+    expected = [found for found in everything if found[0] not in excluded]
     assert index.query(places[3], top_k=5, exclude=excluded) == expected[:5]
     result = index.compare(places[3])
     assert [result.similarity_of(place) for place in places] == [dict(everything).get(place, 0.0) for place in places]
@@ -176,7 +174,7 @@ def test_before_the_first_training_nothing_is_found(strategy):
     assert index.query(places[0], 5) == []
     assert (index.word_count, index.version, index.trained_on, len(index)) == (0, 0, None, 4)
     index.add(4, places[0])
-    assert index.query(places[1], 1)[0].id == 1
+    assert index.query(places[1], 1)[0][0] == 1
     assert index.word_count > 1
     assert index.trained_on == 5
 
@@ -195,7 +193,7 @@ def test_poor_places_are_stored_and_harm_nothing(strategy, scoring, codes):
     assert len(index) == 60
     own = index.query(codes, top_k=100)
     if len(codes) and index.word_count > 1:
-        assert {found.id for found in own if found.similarity > 1.0 - 1e-9} == set(range(100, 140))
+        assert {stored for stored, similarity in own if similarity > 1.0 - 1e-9} == set(range(100, 140))
     else:  # rebuilt on such places alone there is one word, which tells nothing
         assert own == [] or scoring is Scoring.MATCHES
     for number in range(100, 140):
@@ -214,19 +212,19 @@ def test_ten_thousand_identical_places_are_one_to_any_query(scoring):
     assert index.word_count == len(np.unique(place, axis=0))  # equal descriptors are one word, however many
     found = index.query(place, top_k=5)
     expected = [(number, 1.0) for number in range(5)] if scoring is Scoring.MATCHES else []  # idf 0 tells nothing
-    assert [(f.id, round(f.similarity, 9)) for f in found] == expected
+    assert [(stored, round(similarity, 9)) for stored, similarity in found] == expected
     if scoring is Scoring.MATCHES:
         other = random_places(np.random.default_rng(4), 1)[0]
         index.add(10_000, other)
-        assert index.query(place, top_k=1)[0].id == 0
-        assert [(f.id, round(f.similarity, 9)) for f in index.query(other, top_k=1)] == [(10_000, 1.0)]
+        assert index.query(place, top_k=1)[0][0] == 0
+        assert [(stored, round(similarity, 9)) for stored, similarity in index.query(other, top_k=1)] == [(10_000, 1.0)]
 
 
 @EVERY
 @pytest.mark.parametrize("tree", [TreeConfig(branching=2, depth=1), TreeConfig(branching=64, depth=8)])
 def test_extreme_trees_and_a_window_smaller_than_the_first_batch(strategy, tree):
     index, places = filled(strategy, tree=tree, train_batch=9, capacity=1)
-    assert index.query(places[30], 1)[0].id == 30
+    assert index.query(places[30], 1)[0][0] == 30
     check_stored(index, places)
 
 

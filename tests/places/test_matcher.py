@@ -32,10 +32,7 @@ class Visits:
         poses = se2.compose(np.array(pose), steps)
         scans = [(scan_at(p, world, noise_m=0.01, rng=rng), s) for p, s in zip(poses, steps, strict=True)]
         submap = build_submap(scans)
-        features = describe(submap.surface.points)
-        place = Place(
-            KeyscanId(robot, number), Channel.LIDAR, "v", number, number, features.keypoints_m, features.descriptors
-        )
+        place = Place(KeyscanId(robot, number), Channel.LIDAR, "v", number, number, *describe(submap.surface.points))
         self.submaps[place.id] = submap
         return place
 

@@ -40,7 +40,7 @@ def test_a_restored_index_goes_on_as_the_original(strategy, scoring):
         assert (len(other), other.word_count, other.version) == (len(index), index.word_count, index.version)
         assert other.trained_on == index.trained_on
         found, expected = other.query(place, 100), index.query(place, 100)
-        assert [f.similarity for f in found] == pytest.approx([f.similarity for f in expected], abs=1e-9)
+        assert [s for _, s in found] == pytest.approx([s for _, s in expected], abs=1e-9)
         assert dict(found) == pytest.approx(dict(expected), abs=1e-9)
         assert other.bag(place).words.tolist() == index.bag(place).words.tolist()
         for each in (index, other):

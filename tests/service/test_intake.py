@@ -32,7 +32,7 @@ class Desk:
         self.intake = Intake(self.store, lambda: self.now, lambda: 1e9)
 
     def take(self, *data, robot="a", agent="x", known=-1):
-        batch = self.intake.take(robot, agent, write_batch(data), known).batch
+        batch, _, _ = self.intake.take(robot, agent, write_batch(data), known)
         return [decode(packet).body for packet in read_batch(batch)]
 
 

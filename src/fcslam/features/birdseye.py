@@ -9,7 +9,6 @@ of submaps: its patch covers only 1.5 m here, and FAST corners on smooth ridges 
 Column and row of the picture grow with x and y of the submap's coordinate frame.
 """
 
-from dataclasses import dataclass
 from functools import cache
 
 import cv2
@@ -37,17 +36,11 @@ _SUBCELLS = 4
 Picture = NDArray[np.uint8]
 
 
-@dataclass(frozen=True, slots=True)
-class BirdseyeFeatures:
-    """Features of one submap, the strongest first."""
-
-    keypoints_m: NDArray[np.float32]
-    """Shape (K, 2): x, y in the submap's coordinate frame."""
-    descriptors: Codes
-    """Shape (K, 32)."""
+Features = tuple[NDArray[np.float32], Codes]
+"""Keypoints of one submap, the strongest first, shape (K, 2): x, y in its coordinate frame; and their descriptors."""
 
 
-def describe(points: FloatArray, most: int = 400) -> BirdseyeFeatures:
+def describe(points: FloatArray, most: int = 400) -> Features:
     """Detect and describe the ``most`` strongest features of a submap; K = 0 if the picture has no corner.
 
     The points (N, 2), in metres in the submap's coordinate frame, are one per 5-10 cm of wall. Those that are not
@@ -58,11 +51,11 @@ def describe(points: FloatArray, most: int = 400) -> BirdseyeFeatures:
     picture = likelihood_picture(points)
     corners = cv2.goodFeaturesToTrack(picture, most, qualityLevel=0.003, minDistance=0, blockSize=3)
     if corners is None:
-        return BirdseyeFeatures(frozen(np.empty((0, 2)), np.float32), frozen(np.empty((0, CODE_BYTES)), np.uint8))
+        return frozen(np.empty((0, 2)), np.float32), frozen(np.empty((0, CODE_BYTES)), np.uint8)
     pixels = corners.reshape(-1, 2).astype(np.int64)
     directions = _directions(picture, pixels, round(0.8 / _CELL_M))  # by the centroid of a disc of 0.8 m
     codes = np.packbits(_compare(picture, pixels, directions, _comparison_pattern()), axis=1)
-    return BirdseyeFeatures(frozen(pixels_to_metres(pixels), np.float32), frozen(codes, np.uint8))
+    return frozen(pixels_to_metres(pixels), np.float32), frozen(codes, np.uint8)
 
 
 def likelihood_picture(points: FloatArray, side: int = _SIDE_CELLS) -> Picture:

@@ -1,7 +1,7 @@
 """The place index: an inverted index over a dynamic vocabulary that retrieves the places most similar to a query."""
 
 from collections.abc import Callable, Container, Sequence
-from typing import Any, Generic, NamedTuple, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +24,6 @@ _MOST_LEVELS = 16
 _MERGED_SHARE = 4
 """A merged word holds at most 1 / 4 of ``leaf_capacity``, so that it does not split again soon."""
 _NO_CODES = np.empty((0, CODE_WORDS), np.uint64)
-
-
-class ScoredPlace(NamedTuple, Generic[PlaceId]):
-    """A stored place and its similarity to the query."""
-
-    id: PlaceId
-    similarity: float
-    """In [0, 1], by the measure that ``VocabularyConfig.scoring`` names."""
 
 
 class QueryResult(Generic[PlaceId]):
@@ -60,19 +52,20 @@ class QueryResult(Generic[PlaceId]):
             self._by_place = dict(zip(ids, self._scores.tolist(), strict=True))
         return self._by_place.get(place, default)
 
-    def best(self, top_k: int, wanted: Callable[[PlaceId], bool] = lambda _: True) -> list[ScoredPlace[PlaceId]]:
-        """Return up to ``top_k`` places for which ``wanted`` holds, the most similar first.
+    def best(self, top_k: int, wanted: Callable[[PlaceId], bool] = lambda _: True) -> list[tuple[PlaceId, float]]:
+        """Return up to ``top_k`` places for which ``wanted`` holds, and their similarities in [0, 1].
 
-        Ties are broken by the order of storage. A place that has nothing in common with the query is never returned.
+        The most similar comes first; ties are broken by the order of storage. A place that has nothing in common with
+        the query is never returned.
         """
-        found: list[ScoredPlace[PlaceId]] = []
+        found: list[tuple[PlaceId, float]] = []
         looked_at, count = 0, 2 * top_k + 16
         while looked_at < len(self._rows) and len(found) < top_k:
             order = self._order(count)
             for position in order[looked_at:]:
                 place = self._ids[self._rows[position]]
                 if wanted(place):
-                    found.append(ScoredPlace(place, float(self._scores[position])))
+                    found.append((place, float(self._scores[position])))
                     if len(found) == top_k:
                         break
             looked_at, count = len(order), 4 * count
@@ -144,7 +137,7 @@ class PlaceIndex(Generic[PlaceId]):
 
     def query(
         self, descriptors: Codes, top_k: int, exclude: Container[PlaceId] = frozenset()
-    ) -> list[ScoredPlace[PlaceId]]:
+    ) -> list[tuple[PlaceId, float]]:
         """Return the ``top_k`` stored places most similar to these descriptors (N, 32), the most similar first."""
         return self.compare(descriptors).best(top_k, lambda place: place not in exclude)
 

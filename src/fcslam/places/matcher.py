@@ -262,7 +262,10 @@ class PlaceMatcher:
     ) -> list[PlaceMatch]:
         """The places with M_ij = 1, the most similar first."""
         found = result.best(len(self._places), is_unaligned)
-        matches = [PlaceMatch.similar(f.id, place.id, place.channel, f.similarity, self._config.delta) for f in found]
+        matches = [
+            PlaceMatch.similar(stored, place.id, place.channel, similarity, self._config.delta)
+            for stored, similarity in found
+        ]
         return [match for match in matches if match.M]
 
     def _comparisons(
@@ -348,7 +351,7 @@ class PlaceMatcher:
         eligible = [i for i in self._places if is_unaligned(i)]
         if len(eligible) <= self._config.small_fleet or self._index.trained_on is None:
             return eligible
-        return [found.id for found in result.best(self._config.candidates, is_unaligned)]
+        return [stored for stored, _ in result.best(self._config.candidates, is_unaligned)]
 
     def _lookalikes(
         self,
@@ -362,7 +365,7 @@ class PlaceMatcher:
         def is_known(i: KeyscanId) -> bool:
             return i.robot != robot and i not in predicted and not is_unaligned(i)
 
-        return [found.id for found in result.best(ALIGNED_CANDIDATES, is_known)]
+        return [stored for stored, _ in result.best(ALIGNED_CANDIDATES, is_known)]
 
     def _near(self, i: KeyscanId, place: Place, T_i_j: FloatArray) -> _Comparison:
         """The comparison of a predicted pair.

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field
 
 from fcslam.config import Settings
 from fcslam.errors import FeatureError
-from fcslam.features.birdseye import DETECTOR_VERSION, BirdseyeFeatures
+from fcslam.features.birdseye import DETECTOR_VERSION, Features
 from fcslam.features.birdseye import describe as describe_surface
 from fcslam.features.codes import mutual_matches
 from fcslam.geometry import se2
@@ -262,8 +262,7 @@ class _Session:
         return [hello, *(self._camera_place(view) for view in fresh)]
 
     def _lidar_place(self, submap: FinishedSubmap) -> Place:
-        keyscan, features = KeyscanId(self._robot, submap.anchor), self._own_places.features(submap.anchor)
-        described = features.keypoints_m, features.descriptors
+        keyscan, described = KeyscanId(self._robot, submap.anchor), self._own_places.features(submap.anchor)
         return Place(keyscan, Channel.LIDAR, DETECTOR_VERSION, submap.first, submap.last, *described)
 
     def _camera_place(self, view: Place) -> Place:
@@ -293,13 +292,12 @@ class OwnPlaces:
 
     def store(self, keyscan: int, surface: FloatArray) -> None:
         """Describe and store a submap by the points of its surfaces, shape (N, 2), metres in its anchor's base."""
-        features = describe_surface(surface)
-        self._keypoints_m[keyscan], self._waiting[keyscan] = features.keypoints_m, features.descriptors
+        self._keypoints_m[keyscan], self._waiting[keyscan] = describe_surface(surface)
 
-    def features(self, keyscan: int) -> BirdseyeFeatures:
+    def features(self, keyscan: int) -> Features:
         """The description of a stored submap."""
         waiting = self._waiting.get(keyscan)
-        return BirdseyeFeatures(self._keypoints_m[keyscan], self._descriptors(keyscan) if waiting is None else waiting)
+        return self._keypoints_m[keyscan], self._descriptors(keyscan) if waiting is None else waiting
 
     def most_similar(self, keyscan: int, among: Collection[int], most: int) -> list[int]:
         """At most ``most`` of these stored submaps that look like a stored one, the most similar first."""
@@ -307,7 +305,7 @@ class OwnPlaces:
             self._index.add(stored, descriptors)
         self._waiting.clear()
         result = self._index.compare(self._descriptors(keyscan))
-        return [found.id for found in result.best(most, lambda place: place in among)]
+        return [stored for stored, _ in result.best(most, lambda place: place in among)]
 
     def forget(self, keyscan: int) -> None:
         """Forget a stored submap."""
@@ -319,9 +317,9 @@ class OwnPlaces:
 
     def motions(self, a: int, b: int) -> list[FloatArray]:
         """Motions ``T_a_b``, shape (3,), that enough keypoints of two stored submaps support, the best first."""
-        of_a, of_b = self.features(a), self.features(b)
-        matches = mutual_matches(of_a.descriptors, of_b.descriptors, LARGEST_HAMMING)
-        proposed = rigid_hypotheses(of_a.keypoints_m, of_b.keypoints_m, matches)
+        (keypoints_a, descriptors_a), (keypoints_b, descriptors_b) = self.features(a), self.features(b)
+        matches = mutual_matches(descriptors_a, descriptors_b, LARGEST_HAMMING)
+        proposed = rigid_hypotheses(keypoints_a, keypoints_b, matches)
         return [T_a_b for T_a_b, inliers in proposed if len(inliers) >= LEAST_INLIERS]
 
 

@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from fcslam.cloud.claims import ClaimLimits
@@ -42,18 +41,6 @@ class RefusedPacketError(FcslamError):
     def __init__(self, message: str, index: int) -> None:
         super().__init__(message)
         self.index = index
-
-
-@dataclass(frozen=True, slots=True)
-class IntakeReply:
-    """The reply to a batch."""
-
-    batch: bytes
-    """Acknowledgements and, if they are news, a correction and detectors."""
-    refused: int
-    """How many of the robot's packets were refused, by the worker too."""
-    removed: bool
-    """Whether an administrator removed the session of its newest packet."""
 
 
 class SessionState(NamedTuple):
@@ -152,8 +139,13 @@ class Intake:
         self._log, self._arrivals = PacketLog(), 0
         self.follow()
 
-    def take(self, robot: str, agent: str, batch: bytes, known_correction: int) -> IntakeReply:
-        """Store a robot's packets; the reply acknowledges all that is stored without a gap.
+    def take(self, robot: str, agent: str, batch: bytes, known_correction: int) -> tuple[bytes, int, bool]:
+        """Store a robot's packets.
+
+        Returns:
+            A batch that acknowledges all that is stored without a gap, with a correction and detectors if they are
+            news; how many of the robot's packets were refused, by the worker too; and whether an administrator removed
+            the session of its newest packet.
 
         Raises:
             PacketError: the batch cannot be taken apart; nothing is stored.
@@ -180,7 +172,7 @@ class Intake:
             raise refusal
         epochs = sorted({epoch for _, epoch, _ in numbers}) or [s.epoch for s in self.sessions(robot)[-1:]]
         removed = bool(epochs) and is_removed(session_name(robot, epochs[-1]), in_force(self._store.edits()))
-        return IntakeReply(self._replies(robot, epochs, known_correction), self._store.refusal_count(robot), removed)
+        return self._replies(robot, epochs, known_correction), self._store.refusal_count(robot), removed
 
     def last_heard_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch; None: never since the service started."""

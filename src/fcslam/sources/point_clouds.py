@@ -144,13 +144,14 @@ def scan_of_cloud(
     angles = np.arctan2(xy[kept, 1], xy[kept, 0])
     if turn is None or not is_timed:
         if turn is not None:  # the drive may show how long it takes, if the directions are in the order of time
-            first = turn.directions(count)[0]
+            first, _ = _directions(turn, count)
         index = np.remainder(np.rint(angles / spacing_rad).astype(np.int64) - first, count)
         if is_timed:
             sweep = Sweep(float(cloud.times_s.min()) - offset_s, float(cloud.times_s.max()) - offset_s)
     else:
-        offset_s, (first, sweep) = 0.0, turn.directions(count)
-        expected = turn.angle_rad + turn.rate_rad_s * cloud.times_s[kept]
+        offset_s, (first, sweep) = 0.0, _directions(turn, count)
+        angle_rad, rate_rad_s, _ = turn
+        expected = angle_rad + rate_rad_s * cloud.times_s[kept]
         stray = np.remainder(angles - expected + pi, tau) - pi
         index = np.rint((expected + stray) / spacing_rad).astype(np.int64) - first
         index[np.abs(stray) > _STRAY_RAD] = -1
@@ -316,24 +317,19 @@ def _levelling(normal: FloatArray, heading_rad: float) -> FloatArray:
     return result
 
 
-class _Turn(NamedTuple):
-    """A scanner looks along ``angle_rad + rate_rad_s * t`` at the time ``t`` after the stamp."""
-
-    angle_rad: float
-    rate_rad_s: float
-    begin_s: float
-
-    def directions(self, count: int) -> tuple[int, Sweep]:
-        """The first of ``count`` directions in spacings, and the times of the directions."""
-        spacing_rad = tau / count
-        begin = round((self.angle_rad + self.rate_rad_s * self.begin_s) / spacing_rad)
-        first = begin if self.rate_rad_s > 0.0 else begin - count + 1
-        ends = np.array([first, first + count - 1]) * spacing_rad
-        first_s, last_s = ((ends - self.angle_rad) / self.rate_rad_s).tolist()
-        return first, Sweep(first_s, last_s)
+def _directions(turn: tuple[float, float, float], count: int) -> tuple[int, Sweep]:
+    """The first of ``count`` directions of a turn in spacings, and the times of the directions."""
+    angle_rad, rate_rad_s, begin_s = turn
+    spacing_rad = tau / count
+    begin = round((angle_rad + rate_rad_s * begin_s) / spacing_rad)
+    first = begin if rate_rad_s > 0.0 else begin - count + 1
+    ends = np.array([first, first + count - 1]) * spacing_rad
+    first_s, last_s = ((ends - angle_rad) / rate_rad_s).tolist()
+    return first, Sweep(first_s, last_s)
 
 
-def _turn(xy: FloatArray, times_s: FloatArray) -> _Turn | None:
+def _turn(xy: FloatArray, times_s: FloatArray) -> tuple[float, float, float] | None:
+    """Angle, rate and first time: the scanner looks along ``angle + rate * t`` at the time ``t`` after the stamp."""
     if len(times_s) < _SLOTS or not times_s.max() > times_s.min():
         return None
     begin_s, end_s = float(times_s.min()), float(times_s.max())
@@ -350,7 +346,7 @@ def _turn(xy: FloatArray, times_s: FloatArray) -> _Turn | None:
     deviation_rad = float(np.sqrt(np.mean((angles - angle - rate * times) ** 2)))
     if not _SHORTEST_TURN_RAD < turned_rad < 1.2 * tau or deviation_rad > _STRAY_RAD:
         return None
-    return _Turn(float(angle), float(rate), begin_s)
+    return float(angle), float(rate), begin_s
 
 
 def _ranges(xy: FloatArray, index: NDArray[np.int64], first: int, count: int) -> Ranges:

@@ -9,7 +9,6 @@ import math
 from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Protocol
 
 import numpy as np
@@ -43,6 +42,9 @@ FIRST_STAMP = 1000.0
 STAMP_SHIFT_S = 0.001
 """Offset between the stamps of two robots, so that a stamp identifies its robot."""
 _T_BASE_LASER = (0.05, 0.0, 0.0)
+_BUILDING, _LOOKS, _GOALS, _ROBOTS, _LAMPS, _SCANS, _IMAGES = range(7)
+"""Purposes of random numbers. Each has its own generator, so that none affects another; ``_ROBOTS``: moved furniture,
+route and odometry of a robot."""
 
 
 class Caster(Protocol):
@@ -187,7 +189,7 @@ class SimulatedRobot:
         """All scans; every call yields the same."""
         caster, settings, (laser,) = self.world.caster(self.plan), self.settings.lidar, self.lasers
         for k in range(len(self.stamps)):
-            rng, stamp, poses = self._generator(_RandomStream.SCANS, k), float(self.stamps[k]), self.T_building_base[k]
+            rng, stamp, poses = self._generator(_SCANS, k), float(self.stamps[k]), self.T_building_base[k]
             sweep = settings.sweep(laser.beams)
             if sweep is not None:
                 times_s = np.linspace(sweep.first_s, sweep.last_s, laser.beam_count)
@@ -201,7 +203,7 @@ class SimulatedRobot:
         settings = self.settings.camera
         if self.camera is None or self.decoration is None or settings is None:
             return
-        light = light_of(self.plan, self.lighting, self._generator(_RandomStream.LAMPS))
+        light = light_of(self.plan, self.lighting, self._generator(_LAMPS))
         fov_y_rad = 2.0 * math.atan(0.5 * self.camera.height / self.camera.fy)
         model = furnished_model(self.plan, self.decoration, light, (settings.width, settings.height), fov_y_rad)
         poses = self.route.at(self.image_stamps - self.first_stamp)
@@ -209,31 +211,18 @@ class SimulatedRobot:
         shape = (settings.height, settings.width, 1)
         with Camera(model, self.camera, light) as camera:
             for k in range(len(self.image_stamps)):
-                noise = self._generator(_RandomStream.IMAGES, k).standard_normal(shape, dtype=np.float32)
+                noise = self._generator(_IMAGES, k).standard_normal(shape, dtype=np.float32)
                 picture = camera.take(poses[k]).astype(np.float32)
                 encoded = _jpeg(picture + settings.noise * noise)
                 T_odom_base = None if odometry is None else odometry[k]
                 yield CameraImage(float(self.image_stamps[k]), encoded, self.camera, T_odom_base)
 
-    def _generator(self, purpose: "_RandomStream", record: int = 0) -> np.random.Generator:
+    def _generator(self, purpose: int, record: int = 0) -> np.random.Generator:
         """A generator for each record, so that no record depends on another one."""
         return _generator(self.seed, purpose, self.number, record)
 
 
-class _RandomStream(IntEnum):
-    """Purposes of random numbers. Each has its own generator, so that none affects another."""
-
-    BUILDING = 0
-    LOOKS = 1
-    GOALS = 2
-    ROBOTS = 3
-    """Moved furniture, route and odometry of a robot."""
-    LAMPS = 4
-    SCANS = 5
-    IMAGES = 6
-
-
-def _generator(seed: int, purpose: _RandomStream, robot: int = 0, record: int = 0) -> np.random.Generator:
+def _generator(seed: int, purpose: int, robot: int = 0, record: int = 0) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(purpose, robot, record)))
 
 
@@ -251,13 +240,13 @@ def simulate_fleet(settings: SimulationSettings, seed: int, world: World | None 
     ``world`` replaces the building of the settings; cameras see buildings only.
     """
     world = world or World(settings.building)
-    plan = world.draw(_generator(seed, _RandomStream.BUILDING))
+    plan = world.draw(_generator(seed, _BUILDING))
     _check_room(plan, settings)
-    goals = world.goals(plan, settings.robots, settings.path_length_m, _generator(seed, _RandomStream.GOALS))
-    decoration = decorate(plan, _generator(seed, _RandomStream.LOOKS)) if settings.camera else None
+    goals = world.goals(plan, settings.robots, settings.path_length_m, _generator(seed, _GOALS))
+    decoration = decorate(plan, _generator(seed, _LOOKS)) if settings.camera else None
     robots: list[SimulatedRobot] = []
     for number in range(settings.robots):
-        rng = _generator(seed, _RandomStream.ROBOTS, number)
+        rng = _generator(seed, _ROBOTS, number)
         found = world.changed(plan, goals[number], settings.moved_furniture, rng) if number else plan
         robots.append(_robot(world, found, decoration, number, goals[number], settings, seed, rng))
     return SimulatedFleet(plan, tuple(robots))

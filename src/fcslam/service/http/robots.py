@@ -19,7 +19,6 @@ from fcslam.service.http.responses import (
     refusals,
 )
 from fcslam.service.http.state import ServiceState
-from fcslam.service.intake import IntakeReply
 from fcslam.wire.batches import (
     AGENT_HEADER,
     CORRECTION_HEADER,
@@ -68,15 +67,15 @@ def robot_router(state: ServiceState) -> APIRouter:
         body = await read_body(request, MAXIMUM_BATCH_BYTES)
         mission = state.mission
 
-        def take() -> IntakeReply:
+        def take() -> tuple[bytes, int, bool]:
             state.rate.check(robot, body)
             return mission.intake.take(robot, agent, body, correction)
 
-        reply = await run_in_threadpool(take)
+        reply, refused, removed = await run_in_threadpool(take)
         mission.worker.notify()
-        state.measures.answer(robot, reply.batch)
-        headers = {REFUSED_HEADER: str(reply.refused), REMOVED_HEADER: str(int(reply.removed))}
-        return Response(reply.batch, media_type=MEDIA_TYPE, headers=headers)
+        state.measures.answer(robot, reply)
+        headers = {REFUSED_HEADER: str(refused), REMOVED_HEADER: str(int(removed))}
+        return Response(reply, media_type=MEDIA_TYPE, headers=headers)
 
     @router.get("/robots/{robot}/state", dependencies=as_robot, responses=refusals(507))
     def get_state(robot: Name) -> RobotState:

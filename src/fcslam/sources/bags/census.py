@@ -120,15 +120,6 @@ class BagMessage(NamedTuple):
         return self.decoded
 
 
-class _Index(NamedTuple):
-    parts: tuple[BagPart, ...]
-    census: dict[Topic, TopicCensus]
-    rows: NDArray[np.int64]
-    """Time, number of the topic and of the part, and place of each message that can be read, in the order of time."""
-    tape: int
-    """File descriptor of the decoded messages."""
-
-
 @dataclass(frozen=True)
 class DecodedBag:
     """A bag: one file, or several that are parts of one recording, merged by the times of recording.
@@ -144,17 +135,19 @@ class DecodedBag:
     @property
     def topics(self) -> tuple[Topic, ...]:
         """All topics, sorted by name; a topic with two types is listed twice."""
-        return tuple(self._index.census)
+        return tuple(self.census)
 
     @property
     def census(self) -> dict[Topic, TopicCensus]:
         """What the messages of each topic name; those that are invalid are left out."""
-        return self._index.census
+        _, census, _, _ = self._index
+        return census
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Which files were not read to their end, as sentences."""
-        return tuple(part.note for part in self._index.parts if part.note)
+        parts, _, _, _ = self._index
+        return tuple(part.note for part in parts if part.note)
 
     def tree(self, topics: Iterable[Topic]) -> TransformTree:
         """The frames and transforms on these topics of tf."""
@@ -174,18 +167,17 @@ class DecodedBag:
             payloads: dict[int, Callable[[MessagePlace], bytes]] = {}
             for begin in range(0, len(rows), _ROWS_AT_ONCE):
                 block = rows[begin : begin + _ROWS_AT_ONCE]
-                for time_ns, number, at, *place in block[np.isin(block[:, 1], list(by_number))].tolist():
+                for time_ns, number, at, chunk, offset, size in block[np.isin(block[:, 1], list(by_number))].tolist():
                     topic = by_number[number]
                     counts[topic] += 1
                     decoded: Any
                     if topic.type in _KEPT:
-                        _, offset, size = place
                         decoded = _unpacked(os.pread(tape, size, offset))
                     else:
                         with parts[at].translated():
                             if at not in payloads:
                                 payloads[at] = opened.enter_context(parts[at].file.reading())
-                            payload = payloads[at](MessagePlace(*place))
+                            payload = payloads[at]((chunk, offset, size))
                         try:
                             decoded = _decode(payload, topic.type, parts[at].file.ros1)
                         except ValueError as error:
@@ -193,7 +185,11 @@ class DecodedBag:
                     yield BagMessage(topic, counts[topic], time_ns, decoded)
 
     @cached_property
-    def _index(self) -> _Index:
+    def _index(self) -> tuple[tuple[BagPart, ...], dict[Topic, TopicCensus], NDArray[np.int64], int]:
+        """The parts; the topics; the messages that can be read; the file descriptor of the decoded ones.
+
+        A message is a row of its time, the numbers of its topic and its part, and its place. They are in order of time.
+        """
         parts, rows = open_parts(self.path), array("q")
         found: dict[tuple[str, str], TopicCensus] = {}
         try:
@@ -214,7 +210,7 @@ class DecodedBag:
                         content = _counted(topic, message, part.file.ros1)
                         if content is not None and message.kind in _KEPT:
                             size = tape.write(_packed(content))
-                            place, written = MessagePlace(-1, written, size), written + size
+                            place, written = (-1, written, size), written + size
                     rows.extend((time_ns, topic.number, at, *place))
                 for named in part.file.topics.values():
                     found.setdefault(named, TopicCensus(len(found)))
@@ -235,7 +231,7 @@ class DecodedBag:
         for read in census if len(parts) > 1 else ():
             own = table[table[:, 1] == census[read].number] if read.type in SCANS else table[:0]
             check_order(read.name, ((parts[at].path, time_ns) for time_ns, _, at, *_ in own.tolist()))
-        return _Index(parts, census, table, tape.fileno())
+        return parts, census, table, tape.fileno()
 
 
 def _messages(part: BagPart) -> Iterator[StoredMessage]:

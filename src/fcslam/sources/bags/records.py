@@ -29,14 +29,9 @@ _ROS1_MAGIC_BYTES = len(b"#ROSBAG V2.0\n")
 _SQLITE_HEADER_BYTES = 100
 
 
-class MessagePlace(NamedTuple):
-    """Where a message lies in its file."""
-
-    chunk: int
-    """Number of its chunk; -1: in none."""
-    offset: int
-    """Bytes from the beginning of the chunk or the file; in a database the number of the row."""
-    size: int
+MessagePlace = tuple[int, int, int]
+"""Where a message lies in its file: number of its chunk (-1: in none); bytes from the beginning of the chunk or the
+file, or in a database the number of the row; and size in bytes."""
 
 
 class StoredMessage(NamedTuple):
@@ -58,13 +53,6 @@ _ENDS = ValueError, KeyError, struct.error
 """Raised where a record has no such field, or is shorter than its fields."""
 
 
-class _Chunk(NamedTuple):
-    start: int
-    packed_bytes: int
-    compression: str
-    size: int
-
-
 class RecordFile:
     """A bag of ROS 1, or an MCAP file."""
 
@@ -76,7 +64,8 @@ class RecordFile:
         """Where and why the reading ended before the end of the file; empty if it did not."""
         self._is_mcap = not ros1
         self._size = path.stat().st_size
-        self._chunks: list[_Chunk] = []
+        self._chunks: list[tuple[int, int, str, int]] = []
+        """Start, packed bytes, compression and size of each."""
         self._unpacked = 0
         self.topics: dict[int, tuple[str, str]] = {}
         """Names and types by the numbers in the file, once it was read; some may have no message."""
@@ -102,18 +91,19 @@ class RecordFile:
 
             def payload(place: MessagePlace) -> bytes:
                 nonlocal unpacked
-                if place.chunk < 0:
-                    file.seek(place.offset)
-                    return file.read(place.size)
-                if place.chunk not in kept:
-                    start, packed_bytes, compression, size = self._chunks[place.chunk]
+                chunk, offset, size = place
+                if chunk < 0:
+                    file.seek(offset)
+                    return file.read(size)
+                if chunk not in kept:
+                    start, packed_bytes, compression, whole_bytes = self._chunks[chunk]
                     file.seek(start)
-                    kept[place.chunk] = unpack(file.read(packed_bytes), compression, size)
-                    unpacked += len(kept[place.chunk])
+                    kept[chunk] = unpack(file.read(packed_bytes), compression, whole_bytes)
+                    unpacked += len(kept[chunk])
                     check_unpacked(self._size, unpacked, _REREAD_RATIO)
                     while len(kept) > 1 and sum(map(len, kept.values())) > _KEPT_BYTES:
                         del kept[next(iter(kept))]
-                return kept[place.chunk][place.offset : place.offset + place.size]
+                return kept[chunk][offset : offset + size]
 
             yield payload
 
@@ -133,7 +123,7 @@ class RecordFile:
                 whole_bytes, crc = struct.unpack_from("<QI", content, 16)
                 compression, at = _text(content, 28)
                 packed_bytes, at = int.from_bytes(content[at : at + 8], "little"), at + 8
-                packed = _Chunk(start + at, packed_bytes, compression, whole_bytes)
+                packed = start + at, packed_bytes, compression, whole_bytes
                 yield from self._in_chunk(packed, content[at : at + packed_bytes], 0 if is_cut else crc)
             if is_cut:
                 raise DamageError
@@ -144,7 +134,7 @@ class RecordFile:
             elif opcode == _MESSAGE:
                 channel, _, time_ns, _ = struct.unpack_from("<HIQQ", content)
                 if channel in self.topics:
-                    place = MessagePlace(chunk, start + 22, size - 22)
+                    place = chunk, start + 22, size - 22
                     yield StoredMessage(*self.topics[channel], time_ns, content[22:], place)
             elif opcode == _HEADER:
                 self._schemas.clear()
@@ -166,7 +156,7 @@ class RecordFile:
             start, content = file.tell(), _read(file, size)
             if operation == _ROS1_CHUNK and chunk < 0:
                 compression = fields[b"compression"].decode(errors="replace")
-                packed = _Chunk(start, size, compression, int.from_bytes(fields[b"size"], "little"))
+                packed = start, size, compression, int.from_bytes(fields[b"size"], "little")
                 yield from self._in_chunk(packed, content)
             if len(content) < size:
                 raise DamageError
@@ -178,21 +168,22 @@ class RecordFile:
                 seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
                 connection = int.from_bytes(fields[b"conn"], "little")
                 if connection in self.topics:
-                    time_ns, place = seconds * NANOSECONDS + nanoseconds, MessagePlace(chunk, start, size)
+                    time_ns, place = seconds * NANOSECONDS + nanoseconds, (chunk, start, size)
                     yield StoredMessage(*self.topics[connection], time_ns, content, place)
 
-    def _in_chunk(self, chunk: _Chunk, packed: bytes, crc: int = 0) -> Iterator[StoredMessage]:
+    def _in_chunk(self, chunk: tuple[int, int, str, int], packed: bytes, crc: int = 0) -> Iterator[StoredMessage]:
         """The messages of a chunk, as many as there are; ``crc`` 0: not checked."""
-        if chunk.size > LARGEST_CHUNK_BYTES:
-            raise DamageError(f"a chunk of {chunk.size / 1e6:.0f} MB would fill the memory")
-        records = unpack(packed, chunk.compression, chunk.size)
-        if len(records) == chunk.size and crc and crc32(records) != crc:
+        _, _, compression, size = chunk
+        if size > LARGEST_CHUNK_BYTES:
+            raise DamageError(f"a chunk of {size / 1e6:.0f} MB would fill the memory")
+        records = unpack(packed, compression, size)
+        if len(records) == size and crc and crc32(records) != crc:
             raise DamageError
         self._unpacked += len(records)
         check_unpacked(self._size, self._unpacked, MOST_STREAM_RATIO)
         self._chunks.append(chunk)
         yield from self._records(BytesIO(records), len(self._chunks) - 1)
-        if len(records) < chunk.size:
+        if len(records) < size:
             raise DamageError
 
 
@@ -222,7 +213,7 @@ class DatabaseFile:
                 if not (isinstance(payload, bytes) and isinstance(time_ns, int)):
                     raise DamageError(f"message {row} is not bytes with a time")
                 if topic in self.topics:
-                    yield StoredMessage(*self.topics[topic], time_ns, payload, MessagePlace(-1, row, 0))
+                    yield StoredMessage(*self.topics[topic], time_ns, payload, (-1, row, 0))
 
     @contextmanager
     def reading(self) -> Iterator[Callable[[MessagePlace], bytes]]:
@@ -230,7 +221,8 @@ class DatabaseFile:
         with closing(open_database(self.path)) as database:
 
             def payload(place: MessagePlace) -> bytes:
-                (content,) = database.execute("SELECT data FROM messages WHERE id = ?", (place.offset,)).fetchone()
+                _, row, _ = place
+                (content,) = database.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()
                 return bytes(content)
 
             yield payload
