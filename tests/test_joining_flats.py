@@ -55,14 +55,10 @@ def test_known_starts_join_robots_that_saw_little_together_and_wrong_ones_nothin
         assert np.allclose(se2.between(*first), se2.between(one.poses[0], other.poses[0]), atol=0.05)
 
 
-def test_flats_with_equal_walls_and_other_furniture_stay_apart():
-    run = run_mission([Drive("a", ROUND, flat(), 0), Drive("b", BACK, lookalike(), 1)], MissionConfig())
-    assert maps_of(run) == {0, 1}
-
-
-def test_known_starts_do_not_join_another_flat():
-    one, other = Drive("a", ROUND, flat(), 0), Drive("b", ROUND, lookalike(), 1)
-    assert maps_of(run_mission([one, other], with_starts(dict.fromkeys("ab", (0.0, 0.0, 0.0))))) == {0, 1}
+@pytest.mark.parametrize(("way", "starts"), [(BACK, {}), (ROUND, dict.fromkeys("ab", (0.0, 0.0, 0.0)))])
+def test_flats_with_equal_walls_and_other_furniture_stay_apart_whatever_the_starts(way, starts):
+    drives = [Drive("a", ROUND, flat(), 0), Drive("b", way, lookalike(), 1)]
+    assert maps_of(run_mission(drives, with_starts(starts))) == {0, 1}
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,11 @@ def no_semaphores(monkeypatch):
     monkeypatch.setattr(synchronize.SemLock, "__init__", refuse)
 
 
-def verify():
+def start_worker(_):
+    worker_process()
+
+
+def verify(_):
     with verifying("2"):
         pass
 
@@ -33,15 +37,10 @@ def drive(logs):
         pass
 
 
-@pytest.mark.parametrize("start", [worker_process, verify])
-def test_workers(no_semaphores, start):
+@pytest.mark.parametrize("start", [start_worker, verify, drive])
+def test_more_than_one_process(no_semaphores, logs, start):
     with pytest.raises(InputError, match="/dev/shm: more than one process needs semaphores"):
-        start()
-
-
-def test_robots_side_by_side(no_semaphores, logs):
-    with pytest.raises(InputError, match="/dev/shm: more than one process needs semaphores"):
-        drive(logs)
+        start(logs)
 
 
 def test_a_single_robot_does_without(no_semaphores, logs):

@@ -34,16 +34,17 @@ def commands() -> list[str]:
     return [line for line in lines if not line.startswith(NOT_HERE)]
 
 
+@pytest.fixture
+def folder():
+    with tempfile.TemporaryDirectory(prefix="fcslam-scale-") as place:
+        yield Path(place)
+
+
 @pytest.mark.system
 @pytest.mark.slow
 @needs_dask
 @pytest.mark.skipif(not HAS_POSTGRES, reason=WHY_NOT)
-def test_the_commands_of_the_page_start_three_instances_that_survive_a_kill():
-    with tempfile.TemporaryDirectory(prefix="fcslam-scale-") as place:
-        run_page(Path(place))
-
-
-def run_page(folder):
+def test_the_commands_of_the_page_start_three_instances_that_survive_a_kill(folder):
     folder.chmod(0o755)  # the database's user must reach its folder
     programs = folder / "bin"
     programs.mkdir()

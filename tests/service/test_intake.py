@@ -83,16 +83,12 @@ def test_every_epoch_in_a_batch_is_acknowledged(desk):
     assert desk.take() == [Acknowledgement("a", 4, 0)], "a robot that only asks hears of its newest session"
 
 
-def limited(desk, **limits):
-    desk.intake = Intake(desk.store, lambda: desk.now, lambda: 1e9, limits=ClaimLimits(**limits))
-
-
 def small(desk, **limits):
     desk.intake = Intake(desk.store, lambda: desk.now, lambda: 1e9, **limits)
 
 
 def test_of_many_sessions_the_later_ones_wait(desk):
-    limited(desk, sessions_per_hour=3)
+    small(desk, limits=ClaimLimits(sessions_per_hour=3))
     hellos = [
         encode(replace(PACKETS[0], epoch=epoch, body=replace(PACKETS[0].body, epoch=epoch))) for epoch in range(5)
     ]
@@ -110,7 +106,7 @@ def test_of_many_sessions_the_later_ones_wait(desk):
 
 
 def test_of_many_packets_the_later_ones_wait(desk):
-    limited(desk, packets_per_s=0.2)
+    small(desk, limits=ClaimLimits(packets_per_s=0.2))
     for _ in range(MAXIMUM_BATCH_PACKETS // len(DATA)):
         desk.take(*DATA)  # a packet that comes again counts again
     left = MAXIMUM_BATCH_PACKETS % len(DATA)
