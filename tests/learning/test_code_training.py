@@ -83,8 +83,8 @@ def test_whole_images_give_what_their_inputs_give(encoder, start):
     network = network_from_state(encoder, start)
     image = torch.rand(2, 1, 64, 48, generator=torch.Generator().manual_seed(1))
     with torch.inference_mode():
-        described = network.body.describe(network.body.code_inputs(image))
-        assert torch.equal(described.code_logits, network(image).code_logits)
+        code_logits, _ = network.body.describe(network.body.code_inputs(image))
+        assert torch.equal(code_logits, network(image).code_logits)
 
 
 def test_training_brings_the_codes_of_a_point_together(light):

@@ -14,7 +14,6 @@ from fcslam.learning.code_batches import (  # noqa: E402
     RevisitPair,
     draw_revisits,
 )
-from fcslam.learning.network import Description  # noqa: E402
 from fcslam.learning.objective import (  # noqa: E402
     KEYPOINTS_WEIGHT,
     MIN_NEGATIVE_DISTANCE_M,
@@ -67,8 +66,8 @@ def test_points_of_two_pairs_differ_if_they_are_far_apart_in_the_map_and_of_one_
 
 def objective(code_logits, batch, context=0.0):
     still = torch.randn(len(code_logits), 16, 4, 4, generator=torch.Generator().manual_seed(1))
-    before = Description(code_logits, still)
-    return revisit_objective(Description(code_logits, still + context), before, batch)
+    before = code_logits, still
+    return revisit_objective((code_logits, still + context), before, batch)
 
 
 def test_codes_that_agree_cost_least_and_equal_codes_of_all_points_do_not_pay():
@@ -97,7 +96,7 @@ def test_keypoints_that_move_cost():
 def test_codes_that_leave_the_earlier_ones_cost_in_rehearsal():
     points = torch.rand(2, 5, 2, generator=torch.Generator().manual_seed(1)) * (SIZE - 8.0) + 4.0
     columns = torch.randn(2, 256, 12, 12, generator=torch.Generator().manual_seed(2))
-    former = Description(columns, columns[:, :16])
+    former = columns, columns[:, :16]
     same = rehearsal_loss(former, former, points)
-    opposite = rehearsal_loss(Description(-columns, columns[:, :16]), former, points)
+    opposite = rehearsal_loss((-columns, columns[:, :16]), former, points)
     assert opposite > 2.0 * same

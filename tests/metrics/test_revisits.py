@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fcslam.metrics.closures import WITHIN_GAP_S, find_revisits
+from fcslam.metrics.closures import WITHIN_GAP_S, find_revisits, recall_of
 from fcslam.metrics.relations import PoseTable
 
 STEP_M, STEP_S = 0.1, 0.2
@@ -28,33 +28,33 @@ def row_at(truth, robot, metres):
 
 def test_side_by_side_every_metre_of_both_is_a_revisit():
     truth = table(line((0.0, 0.0), 0.0, 10.0), line((0.0, 1.5), 0.0, 10.0))
-    revisits = find_revisits(truth, between_robots=True)
-    assert len(np.unique(revisits.numbers)) == len(revisits.passes) == 22
-    first, second = revisits.passes.T
+    passes, numbers = find_revisits(truth, between_robots=True)
+    assert len(np.unique(numbers)) == len(passes) == 22
+    first, second = passes.T
     assert np.all(truth.robots[first] != truth.robots[second])
     assert truth.T_map_base[first, 0] == pytest.approx(truth.T_map_base[second, 0])
     apart = table(line((0.0, 0.0), 0.0, 10.0), line((0.0, 2.1), 0.0, 10.0))
-    assert len(find_revisits(apart, between_robots=True).passes) == 0
+    assert len(find_revisits(apart, between_robots=True)[0]) == 0
 
 
 @pytest.mark.parametrize(("heading", "count"), [(np.pi, 0), (np.radians(40.0), None), (-np.radians(50.0), 0)])
 def test_like_headings_are_fewer(heading, count):
     truth = table(line((0.0, 0.0), 0.0, 10.0), line((5.0, 0.0), heading, 5.0))
-    anyhow = find_revisits(truth, between_robots=True)
-    alike = find_revisits(truth, between_robots=True, turn_deg=45.0)
-    assert len(anyhow.passes) > 0
-    assert len(alike.passes) == (len(anyhow.passes) if count is None else count)
+    anyhow, _ = find_revisits(truth, between_robots=True)
+    alike, _ = find_revisits(truth, between_robots=True, turn_deg=45.0)
+    assert len(anyhow) > 0
+    assert len(alike) == (len(anyhow) if count is None else count)
 
 
 def test_a_robot_revisits_itself_only_after_a_while():
     there, back = line((0.0, 0.0), 0.0, 20.0), line((20.0, 0.0), np.pi, 20.0)
     truth = table(np.concatenate((there, back)))
-    revisits = find_revisits(truth, between_robots=False)
-    gap_s = np.abs(np.diff(truth.stamps[revisits.passes], axis=1))
+    passes, _ = find_revisits(truth, between_robots=False)
+    gap_s = np.abs(np.diff(truth.stamps[passes], axis=1))
     assert gap_s.min() > WITHIN_GAP_S
     # At x on the way there and x' on the way back 80.2 - 2 x - 2 x' seconds lie between; x' reaches down to x - 2.
-    assert truth.T_map_base[revisits.passes[:, 0], 0].max() == pytest.approx(6.0)
-    assert len(find_revisits(truth, between_robots=True).passes) == 0
+    assert truth.T_map_base[passes[:, 0], 0].max() == pytest.approx(6.0)
+    assert len(find_revisits(truth, between_robots=True)[0]) == 0
 
 
 def test_one_of_several_passes_is_enough_and_both_ends_must_be_near():
@@ -65,7 +65,7 @@ def test_one_of_several_passes_is_enough_and_both_ends_must_be_near():
 
     def found(*ends):
         correct = np.array([(row_at(truth, 0, a), row_at(truth, 1, b)) for a, b in ends], dtype=int).reshape(-1, 2)
-        return revisits.recall(correct, truth)
+        return recall_of(revisits, correct, truth)
 
     # robot 0 is asked at 11 places, robot 1 at 21; one number each, though 0's have two passes
     assert found().revisits == 11 + 21

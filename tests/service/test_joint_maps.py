@@ -25,8 +25,8 @@ def test_frontiers_follow_a_map_that_changes_its_number():
     served = ServedJointMaps()
     before = JointMaps([session("a", 0), session("b", 1)], {0: A, 1: B}, {0: "frame a", 1: "frame b"}, 0.2)
     first = served.explorations(before, 1000.0)
-    assert first[0].goals["a"].point[0] > 3.5
-    assert first[1].goals["b"].point[0] < 0.5
+    assert first[0][2]["a"].point[0] > 3.5
+    assert first[1][2]["b"].point[0] < 0.5
     after = JointMaps([session("b", 0), session("a", 1)], {0: B, 1: A}, {0: "frame b", 1: "frame a"}, 0.2)
     assert served.explorations(after, 1001.0) == {0: first[1], 1: first[0]}
 
@@ -35,7 +35,7 @@ def test_frontiers_of_a_frame_that_is_gone_are_not_served():
     served = ServedJointMaps()
     served.explorations(JointMaps([session("a", 0)], {0: A}, {0: "frame"}, 0.2), 1000.0)
     turned = JointMaps([session("a", 0)], {0: B}, {0: "another frame"}, 0.2)
-    assert served.explorations(turned, 1001.0)[0].goals["a"].point[0] < 0.5
+    assert served.explorations(turned, 1001.0)[0][2]["a"].point[0] < 0.5
 
 
 def test_frontiers_are_kept_for_some_seconds():

@@ -35,13 +35,9 @@ class Maps(NamedTuple):
     """Shape (B, 256, H/8, W/8): positive where a bit is set."""
 
 
-class Description(NamedTuple):
-    """Output of the layers of the codes for a batch."""
-
-    code_logits: Tensor
-    """Shape (B, 256, H/8, W/8), as in ``Maps``."""
-    context: Tensor
-    """The part of their output on which the keypoints depend, shape (B, C, H/8, W/8)."""
+Description = tuple[Tensor, Tensor]
+"""Output of the layers of the codes for a batch: code logits, shape (B, 256, H/8, W/8), as in ``Maps``; and the context
+on which the keypoints depend, shape (B, C, H/8, W/8)."""
 
 
 class KeypointNetwork(nn.Module):
@@ -136,17 +132,17 @@ class LightBody(nn.Module):
         """The codes for the output of ``code_inputs``."""
         around = _twice(self.to_sixteenth(code_inputs))[..., : code_inputs.shape[-2], : code_inputs.shape[-1]]
         joint = self.joint(code_inputs + around)
-        return Description(self.code_head(joint), self.context_eighth(joint))
+        return self.code_head(joint), self.context_eighth(joint)
 
     def forward(self, image: Tensor) -> Maps:
         """As in ``KeypointNetwork``."""
         image = _even_contrast(image)
         half, quarter, eighth = self._resolutions(image)
-        described = self.describe(eighth)
-        context = _twice(self.context_quarter(quarter) + _twice(described.context))
+        code_logits, context_eighth = self.describe(eighth)
+        context = _twice(self.context_quarter(quarter) + _twice(context_eighth))
         points = smoothed(F.pixel_shuffle(self.point_head(half + context), 2))
         points = smoothed(points + self.refine(torch.cat((image, points), dim=1)))
-        return Maps(points.squeeze(1), described.code_logits)
+        return Maps(points.squeeze(1), code_logits)
 
     def _resolutions(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Features at 1/2, 1/4 and 1/8 of the resolution."""
@@ -193,7 +189,7 @@ class VggBody(nn.Module):
 
     def describe(self, code_inputs: Tensor) -> Description:
         """As in ``LightBody``; the keypoints do not depend on the head of the codes."""
-        return Description(self.code_head(code_inputs), code_inputs)
+        return self.code_head(code_inputs), code_inputs
 
     def forward(self, image: Tensor) -> Maps:
         """As in ``KeypointNetwork``."""

@@ -121,14 +121,15 @@ def revisit_objective(
     described by the network that training started from.
     """
     weights = LOSSES["default"]
-    soft = torch.tanh(sample_codes(described.code_logits.float(), batch.points))
+    (code_logits, context), (_, context_before) = described, before
+    soft = torch.tanh(sample_codes(code_logits.float(), batch.points))
     first, second = (side[batch.valid] for side in soft.chunk(2))
     every = torch.ones(len(first), dtype=torch.bool, device=first.device)
-    moved = (described.context.float() - before.context.float()).square().mean()
+    moved = (context.float() - context_before.float()).square().mean()
     parts = {
         "contrastive": losses.contrastive_loss(first, second, revisit_negatives(batch), every, weights.temperature),
         "balance": losses.balance_loss(soft, batch.valid.repeat(2, 1)),
-        "keypoints": moved / before.context.float().var().clamp(min=_STILL),
+        "keypoints": moved / context_before.float().var().clamp(min=_STILL),
     }
     factors = {"contrastive": weights.contrastive, "balance": weights.balance, "keypoints": KEYPOINTS_WEIGHT}
     total = sum((factors[name] * part for name, part in parts.items()), start=torch.zeros_like(moved))
@@ -137,7 +138,7 @@ def revisit_objective(
 
 def rehearsal_loss(described: Description, before: Description, points: Tensor) -> Tensor:
     """Cross entropy of the bits at points (R, N, 2) of views against those of the initial network."""
-    logits, wanted = (SHARPNESS * sample_codes(each.code_logits.float(), points) for each in (described, before))
+    logits, wanted = (SHARPNESS * sample_codes(code_logits.float(), points) for code_logits, _ in (described, before))
     everywhere = torch.ones(points.shape[:2], dtype=torch.bool, device=points.device)
     return losses.distillation_loss(logits, torch.sigmoid(wanted), everywhere)
 

@@ -132,19 +132,18 @@ def _share(part: int, whole: int) -> float:
     return part / whole if whole else np.nan
 
 
-@dataclass(frozen=True, slots=True)
-class Revisits:
-    """Revisits: poses with the passes of one robot near them. A closure to any of the passes finds the revisit."""
+Revisits = tuple[Rows, NDArray[np.int64]]
+"""Revisits: poses with the passes of one robot near them. A closure to any of the passes finds the revisit.
 
-    passes: Rows
-    """Row of the pose and row of the nearest pose of a pass, shape (P, 2)."""
-    numbers: NDArray[np.int64]
-    """Number of the pass's revisit, shape (P,)."""
+Row of the pose and row of the nearest pose of a pass, shape (P, 2); and number of the pass's revisit, shape (P,).
+"""
 
-    def recall(self, correct: Rows, truth: PoseTable) -> Recall:
-        """Recall of the ``correct`` closures (C, 2), with both ends within ``REACH_M`` of path length of a pass."""
-        found = revisits_found(self.passes, correct, truth)
-        return Recall(len(np.unique(self.numbers)), len(np.unique(self.numbers[found])))
+
+def recall_of(revisits: Revisits, correct: Rows, truth: PoseTable) -> Recall:
+    """Recall of the ``correct`` closures (C, 2), with both ends within ``REACH_M`` of path length of a pass."""
+    passes, numbers = revisits
+    found = revisits_found(passes, correct, truth)
+    return Recall(len(np.unique(numbers)), len(np.unique(numbers[found])))
 
 
 def find_revisits(truth: PoseTable, between_robots: bool, turn_deg: float = 180.0) -> Revisits:
@@ -163,7 +162,7 @@ def find_revisits(truth: PoseTable, between_robots: bool, turn_deg: float = 180.
         for nearest in _passes(row, others, truth, turn_deg)
     ]
     table = np.array(found, dtype=np.int64).reshape(-1, 3)
-    return Revisits(table[:, :2], table[:, 2])
+    return table[:, :2], table[:, 2]
 
 
 def _sampled(rows: NDArray[np.int64], metres: NDArray[np.float64], every_m: float) -> NDArray[np.int64]:

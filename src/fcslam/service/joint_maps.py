@@ -12,7 +12,7 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -122,14 +122,9 @@ def read_joint_maps(path: Path) -> JointMaps:
         raise StoreError(f"{path}: no joint maps can be read ({error})") from error
 
 
-class Exploration(NamedTuple):
-    """The frontiers of one map and who explores which of them."""
-
-    robots: tuple[str, ...]
-    """Those whose distances the frontiers have."""
-    frontiers: Sequence[Frontier]
-    goals: Mapping[str, Frontier]
-    """By robot; robots that can reach none are not in it."""
+Exploration = tuple[tuple[str, ...], Sequence[Frontier], Mapping[str, Frontier]]
+"""The robots whose distances the frontiers of one map have; the frontiers; and the one that each robot explores, which
+lacks robots that can reach none."""
 
 
 class ServedJointMaps:
@@ -216,4 +211,4 @@ class ServedJointMaps:
         at = {robot: (pose[0][0], pose[0][1]) for robot, pose in sorted(active.items())[:MOST_EXPLORERS]}
         found = frontiers(maps.grids[number], np.array(list(at.values())).reshape(-1, 2), maps.robot_radius_m)
         found = found[:MOST_FRONTIERS]
-        return Exploration(tuple(at), found, self._explorers[maps.frames[number]].assign(found, at))
+        return tuple(at), found, self._explorers[maps.frames[number]].assign(found, at)

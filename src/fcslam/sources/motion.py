@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from math import hypot
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.records import FloatArray, Sweep
+from fcslam.records import Odometry, Sweep
+from fcslam.sources.bags.messages import OdometryReading
 from fcslam.sources.pose import Pose, relative_pose
 
 SAMPLES: Final = 9
@@ -30,16 +31,7 @@ LEAST_STEP_RAD = 0.005
 """A smaller turn between two readings is that of an encoder at a low speed."""
 
 
-class Reading(Protocol):
-    """A pose by odometry at a time."""
-
-    @property
-    def stamp(self) -> float:
-        """Seconds."""
-
-    @property
-    def T_odom_base(self) -> Pose | FloatArray:
-        """Metres and radians."""
+Reading = Odometry | OdometryReading
 
 
 class OdometryUpdates:

@@ -75,6 +75,10 @@ _STRAY_RAD = 0.15
 _SHORTEST_TURN_RAD = 0.5
 
 
+Plane = tuple[FloatArray, float]
+"""The plane ``normal @ p = distance_m``, with ``normal`` up."""
+
+
 class CloudBand(NamedTuple):
     """Which points of a cloud count."""
 
@@ -109,13 +113,6 @@ class CloudMounting(NamedTuple):
     directions: int = DIRECTIONS
 
 
-class Floor(NamedTuple):
-    """The plane ``normal @ p = distance_m``, with ``normal`` up."""
-
-    normal: FloatArray
-    distance_m: float
-
-
 def scan_of_cloud(
     cloud: PointCloud, mounting: CloudMounting, band: CloudBand, motion: Sweep | None = None
 ) -> ScanMessage:
@@ -132,9 +129,9 @@ def scan_of_cloud(
     floor = floor_in(in_base[outside], mounting)
     if floor is None and not mounting.is_height_known:
         raise ValueError("no floor is seen, so the height of the sensor is not known; publish its pose in tf")
-    floor = floor or Floor(np.array([0.0, 0.0, 1.0]), 0.0)
-    heights_m = in_base @ floor.normal - floor.distance_m
-    xy = ((in_base - mounting.position_m) @ _levelling(floor.normal, mounting.heading_rad).T)[:, :2]
+    normal, distance_m = floor or (np.array([0.0, 0.0, 1.0]), 0.0)
+    heights_m = in_base @ normal - distance_m
+    xy = ((in_base - mounting.position_m) @ _levelling(normal, mounting.heading_rad).T)[:, :2]
     is_timed = len(cloud.times_s) > 0
     turn = _turn(xy, cloud.times_s if is_timed else np.linspace(0.0, 1.0, len(xy))) if motion is None else None
     count, spacing_rad = mounting.directions, tau / mounting.directions
@@ -196,7 +193,7 @@ def leaning(clouds: Iterable[PointCloud], mounting: CloudMounting) -> FloatArray
     """The rotation of a wrong mounting that makes the floor level in most clouds, shape (3, 3); None if it is right."""
     in_base = [cloud.points @ mounting.rotation.T + mounting.position_m for cloud in clouds]
     floors = [floor_in(points, mounting, LARGEST_LEANING_RAD) for points in in_base]
-    normals = np.array([floor.normal for floor in floors if floor is not None]).reshape(-1, 3)
+    normals = np.array([floor[0] for floor in floors if floor is not None]).reshape(-1, 3)
     if len(normals) < max(_FEWEST_FLOORS, len(in_base) // 2):
         return None
     middle = np.median(normals, axis=0)
@@ -207,7 +204,7 @@ def leaning(clouds: Iterable[PointCloud], mounting: CloudMounting) -> FloatArray
     return _levelling(middle, 0.0)
 
 
-def floor_in(points: FloatArray, mounting: CloudMounting, largest_tilt_rad: float = FLOOR_TILT_RAD) -> Floor | None:
+def floor_in(points: FloatArray, mounting: CloudMounting, largest_tilt_rad: float = FLOOR_TILT_RAD) -> Plane | None:
     """The floor among the ``points`` in ``base``; None if none is seen, or if it is where the mounting has it."""
     offset = points - mounting.position_m
     distances_m = np.hypot(offset[:, 0], offset[:, 1])
@@ -224,14 +221,15 @@ def floor_in(points: FloatArray, mounting: CloudMounting, largest_tilt_rad: floa
     floor = _lowest_plane(able, mounting.is_height_known, largest_tilt_rad)
     for _ in range(_FITS):
         floor = floor and _fitted(floor, able)
-    if floor is None or floor.normal[2] < cos(largest_tilt_rad):
+    if floor is None or floor[0][2] < cos(largest_tilt_rad):
         return None
-    height_m = float(floor.normal @ mounting.position_m) - floor.distance_m
+    normal, distance_m = floor
+    height_m = float(normal @ mounting.position_m) - distance_m
     is_off = mounting.is_height_known and abs(height_m - mounting.position_m[2]) > FLOOR_ERROR_M
     return None if is_off or height_m < 0.0 else floor
 
 
-def _lowest_plane(points: FloatArray, is_height_known: bool, largest_tilt_rad: float) -> Floor | None:
+def _lowest_plane(points: FloatArray, is_height_known: bool, largest_tilt_rad: float) -> Plane | None:
     """The plane with most points, less those below it (RANSAC); None if that of the mounting is nearly as good.
 
     It goes through three of the first ``points``, the lowest as seen from the sensor.
@@ -251,11 +249,12 @@ def _lowest_plane(points: FloatArray, is_height_known: bool, largest_tilt_rad: f
     is_of_mounting = is_height_known and scores[0] > _GOOD_MOUNTING * scores[best]
     if scores[best] < _FEWEST_ON_FLOOR or is_of_mounting:
         return None
-    return Floor(normals[best], float(distances_m[best]))
+    return normals[best], float(distances_m[best])
 
 
-def _fitted(floor: Floor, points: FloatArray) -> Floor | None:
-    own = points[np.abs(points @ floor.normal - floor.distance_m) < SAME_SURFACE_M]
+def _fitted(plane: Plane, points: FloatArray) -> Plane | None:
+    normal, distance_m = plane
+    own = points[np.abs(points @ normal - distance_m) < SAME_SURFACE_M]
     if len(own) < _FEWEST_ON_FLOOR:
         return None
     middle = own.mean(axis=0)
@@ -263,7 +262,7 @@ def _fitted(floor: Floor, points: FloatArray) -> Floor | None:
     if variances[1] < _LEAST_EXTENT_M**2:
         return None
     normal = axes[:, 0] * np.copysign(1.0, axes[2, 0])
-    return Floor(normal, float(normal @ middle))
+    return normal, float(normal @ middle)
 
 
 class BodySample:

@@ -18,6 +18,7 @@ from fcslam.metrics.closures import (
     Rows,
     find_revisits,
     precision,
+    recall_of,
 )
 from fcslam.metrics.relations import PoseTable, motion_errors
 from fcslam.records import PLACE_CHANNELS, Channel, ClosureStatus
@@ -117,7 +118,7 @@ def score_closures(run: Run, known: KnownPoses) -> FleetClosures:
         return surer
 
     def recall(members: Mask, revisits: Revisits) -> Recall:
-        return revisits.recall(pairs[members & errors.correct], truth)
+        return recall_of(revisits, pairs[members & errors.correct], truth)
 
     scores = {}
     for within in ClosureScope:

@@ -167,8 +167,9 @@ def _certified(folder: Path, _: tuple[int, int]) -> tuple[QualityReply, ...]:
 
 
 def _summaries(explored: Exploration, robot: str | None) -> Iterator[FrontierReply]:
-    for one in explored.frontiers:
-        lengths = zip(explored.robots, one.distances_m, strict=True)
+    robots, frontiers, goals = explored
+    for one in frontiers:
+        lengths = zip(robots, one.distances_m, strict=True)
         yield FrontierReply(
             point=(round(one.point[0], 3), round(one.point[1], 3)),
             length=round(one.length_m, 2),
@@ -178,7 +179,7 @@ def _summaries(explored: Exploration, robot: str | None) -> Iterator[FrontierRep
                 for name, length_m in lengths
                 if robot in (None, name) and math.isfinite(length_m)
             },
-            robots=tuple(sorted(name for name, goal in explored.goals.items() if goal is one)),
+            robots=tuple(sorted(name for name, goal in goals.items() if goal is one)),
         )
 
 
