@@ -34,13 +34,6 @@ def opened(mapped, folder):
     return fcslam.open_run(folder)
 
 
-def type_checking_imports():
-    """Module by name, as type checkers see them."""
-    tree = ast.parse(inspect.getsource(fcslam))
-    blocks = [node for node in tree.body if isinstance(node, ast.If)]
-    return {alias.name: node.module for block in blocks for node in block.body for alias in node.names}
-
-
 def test_all_holds_every_exception_and_every_name_in_it_exists():
     exceptions = {name for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, Exception)}
     assert set(fcslam.__all__) == exceptions | set(fcslam._LAZY) | {"__version__"}
@@ -50,7 +43,9 @@ def test_all_holds_every_exception_and_every_name_in_it_exists():
 
 
 def test_type_checkers_see_what_the_interpreter_imports():
-    assert type_checking_imports() == fcslam._LAZY
+    blocks = [node for node in ast.parse(inspect.getsource(fcslam)).body if isinstance(node, ast.If)]
+    seen = {alias.name: node.module for block in blocks for node in block.body for alias in node.names}
+    assert seen == fcslam._LAZY
 
 
 def test_the_reference_lists_every_public_name():
@@ -70,12 +65,9 @@ def test_names_load_their_modules_at_the_first_use():
 
 def test_a_run_that_was_opened_can_be_saved_again(opened, tmp_path):
     opened.save(str(tmp_path / "copy"))
-    copy = fcslam.open_run(str(tmp_path / "copy"))
-    assert copy.map_files == opened.map_files
-    assert list(copy.trajectories) == list(opened.trajectories)
+    assert fcslam.open_run(str(tmp_path / "copy")).map_files == opened.map_files
     with pytest.raises(fcslam.InputError, match="force=True"):
         opened.save(tmp_path / "copy")
-    opened.save(tmp_path / "copy", force=True)
 
 
 def test_robots_stand_in_free_cells_of_their_map(opened):

@@ -208,11 +208,6 @@ BROKEN_TEXT = re.compile(r"\"\s*\n\s*f?\"")
 """Where a text in the source goes on in the next line."""
 
 
-def parts_of_messages(text: str) -> list[str]:
-    """Text between the dots of every message."""
-    return [part.strip("() ") for message in MESSAGE.findall(text) for part in message.split("...")]
-
-
 def test_the_page_on_results_explains_every_reason():
     text = (ROOT / "docs" / "howto" / "report.md").read_text(encoding="utf-8")
     assert [reason for reason in ReasonCode if f"`{reason}`" not in text] == []
@@ -221,6 +216,6 @@ def test_the_page_on_results_explains_every_reason():
 def test_every_message_in_troubleshooting_is_one_of_the_code():
     text = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     code = "\n".join(BROKEN_TEXT.sub("", file.read_text(encoding="utf-8")) for file in PACKAGE.rglob("*.py"))
-    parts = parts_of_messages(text)
+    parts = [part.strip("() ") for message in MESSAGE.findall(text) for part in message.split("...")]
     assert len(parts) > 40
     assert [part for part in parts if part not in code] == []

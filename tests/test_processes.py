@@ -23,10 +23,6 @@ def no_semaphores(monkeypatch):
     monkeypatch.setattr(synchronize.SemLock, "__init__", refuse)
 
 
-def start_worker(_):
-    worker_process()
-
-
 def verify(_):
     with verifying("2"):
         pass
@@ -37,7 +33,7 @@ def drive(logs):
         pass
 
 
-@pytest.mark.parametrize("start", [start_worker, verify, drive])
+@pytest.mark.parametrize("start", [lambda _: worker_process(), verify, drive])
 def test_more_than_one_process(no_semaphores, logs, start):
     with pytest.raises(InputError, match="/dev/shm: more than one process needs semaphores"):
         start(logs)

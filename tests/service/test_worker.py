@@ -106,13 +106,15 @@ def expected(robots="ab"):
     return found
 
 
-def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_path, logs, rng_order):
+def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_path, logs):
     config = MissionConfig(seed=3)
     packets = in_order(packet for log in logs[:2] for packet in sent(open_source(log), config.robot))
     expected = run_mission([open_source(log) for log in logs[:2]], config)
     cloud = Cloud(tmp_path / "mission", config.cloud)
-    for batch in rng_order(packets):
-        cloud.put(batch)
+    rng = np.random.default_rng(11)
+    order = rng.permutation(np.concatenate([np.arange(len(packets)), rng.integers(0, len(packets), 50)]))  # 50 twice
+    for batch in np.array_split(order, 9):
+        cloud.put(packets[k] for k in batch)
         cloud.worker.step()
     run = cloud.finalize()
     assert run.pose_graph_g2o == expected.pose_graph_g2o
@@ -128,18 +130,6 @@ def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_pat
         assert robot.robot == same.robot
         assert set(np.round(robot.stamps, 6)) <= set(np.round(same.stamps, 6))
     cloud.store.close()
-
-
-@pytest.fixture
-def rng_order():
-    """Batches of shuffled packets, some of them twice."""
-
-    def batches(packets):
-        rng = np.random.default_rng(11)
-        order = rng.permutation(np.concatenate([np.arange(len(packets)), rng.integers(0, len(packets), 50)]))
-        return [[packets[k] for k in part] for part in np.array_split(order, 9)]
-
-    return batches
 
 
 def test_a_worker_that_starts_again_goes_on_as_if_nothing_had_been(cloud):

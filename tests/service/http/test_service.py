@@ -432,16 +432,11 @@ def test_two_services_do_not_share_a_folder(desk):
         Desk(desk.state.missions.root)
 
 
-def measured(desk):
-    text = get(desk, "../../metrics").text
-    told = (line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
-    return {name: float(value) for name, value in told}
-
-
 def uplink(desk, robot):
     """Bytes of one robot, by the measures."""
-    lines = measured(desk).items()
-    return sum(value for name, value in lines if name.startswith("fcslam_bytes_total{") and f'robot="{robot}"' in name)
+    lines = (line.rsplit(" ", 1) for line in get(desk, "../../metrics").text.splitlines())
+    bytes_ = {name: float(value) for name, value in lines if name.startswith("fcslam_bytes_total{")}
+    return sum(value for name, value in bytes_.items() if f'robot="{robot}"' in name)
 
 
 def test_every_panel_of_the_dashboard_asks_for_a_metric_that_there_is(shown):
