@@ -31,13 +31,10 @@ def alike():
     return small_fleet.sent_by(robot, "below"), small_fleet.sent_by(robot, "above")
 
 
-def on_floors(packets, floors):
-    return in_order(packet.on_floor(floor) for sent, floor in zip(packets, floors, strict=True) for packet in sent)
-
-
 @pytest.mark.parametrize(("floors", "maps"), [(("", ""), 1), (("1", "1"), 1), (("1", "2"), 2), (("", "2"), 2)])
 def test_only_floors_keep_rooms_apart_that_look_alike(alike, floors, maps):
-    result = feed(Cloud(FleetConfig(), 0), on_floors(alike, floors)).finalize()
+    packets = in_order(packet.on_floor(floor) for sent, floor in zip(alike, floors, strict=True) for packet in sent)
+    result = feed(Cloud(FleetConfig(), 0), packets).finalize()
     assert len(set(map_of(result).values())) == maps
     assert {robot.robot: robot.floor for robot in result.robots} == dict(zip(("below", "above"), floors, strict=True))
     between = [closure for closure in result.closures if closure.i.robot != closure.j.robot]
