@@ -337,7 +337,7 @@ def trained_here(
     state = weights_to_network(start, settings.training.encoder).state_dict()
     training = settings.training.model_copy(update={"steps": steps, "seed": seed})
     before = weights_to_network(start, settings.training.encoder)
-    return train_codes(state, revisits, CodeInputs(), LocalTrainingPlan(training, 0, steps), before).network
+    return train_codes(state, revisits, CodeInputs(), LocalTrainingPlan(training, 0, steps), before)[0]
 
 
 def federated(

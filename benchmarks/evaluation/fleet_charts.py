@@ -23,7 +23,7 @@ def fleet_charts(run: Path, truth: Path | None = None) -> FleetCharts:
         InputError: the run has no maps of single robots, or the truth of a robot or the true map is missing.
     """
     opened, folder = open_run(run), truth_folder(run, truth)
-    known = known_poses(opened, folder)
+    known = _, true = known_poses(opened, folder)
     if not opened.local_maps:
         raise InputError(f"{run}: has no {LOCAL}/ with the robots' own maps; map the recordings again")
     return FleetCharts(
@@ -34,15 +34,16 @@ def fleet_charts(run: Path, truth: Path | None = None) -> FleetCharts:
         fused=_fused_chart(run, opened, known),
         building=Chart(
             read_grid(folder / TRUE_MAP),
-            {robot: known.truth.T_map_base[known.truth.robots == k] for k, robot in enumerate(opened.local_maps)},
+            {robot: true.T_map_base[true.robots == k] for k, robot in enumerate(opened.local_maps)},
         ),
         matches=_matches(opened),
     )
 
 
 def _fused_chart(run: Path, opened: Run, known: KnownPoses) -> Chart:
-    members = known.estimate.maps == 0
-    T_building_map = align(known.truth.T_map_base[members], known.estimate.T_map_base[members])
+    estimate, true = known
+    members = estimate.maps == 0
+    T_building_map = align(true.T_map_base[members], estimate.T_map_base[members])
     x, y, theta = T_building_map if np.isfinite(T_building_map).all() else IDENTITY
     trajectories = {t.robot: t.T_map_base for t in opened.trajectories.values() if t.map_index == 0}
     return Chart(read_grid(run / "map.yaml"), trajectories, (float(x), float(y), float(theta)))

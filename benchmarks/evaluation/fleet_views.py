@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.closures import STAGES, ClosureScope, closure_rows, closure_sets
-from fcslam.lab.evaluation.ground_truth import GAP_S, KnownPoses, known_poses
+from fcslam.lab.evaluation.ground_truth import GAP_S, known_poses
 from fcslam.metrics.closures import Rows
+from fcslam.metrics.relations import PoseTable
 from fcslam.metrics.trajectory import interpolate
 from fcslam.records import CameraImage, CameraModel, Channel, ClosureStatus, FloatArray, LaserModel, LaserScan, Ranges
 from fcslam.robot.views import EVERY_M, EVERY_RAD
@@ -176,29 +177,29 @@ def judge_views(path: Path, folder: Path) -> Mapping[ClosureStatus, MatchViews]:
         SourceError: a recording cannot be read.
     """
     run = open_run(path)
-    known = known_poses(run, folder)
-    pairs, sets = closure_rows(run, known.truth), closure_sets(run)
+    _, true = known_poses(run, folder)
+    pairs, sets = closure_rows(run, true), closure_sets(run)
     camera = np.array([closure.channel is Channel.CAMERA for closure in run.closures], dtype=np.bool_)
     judged = sets[ClosureScope.FLEET, ClosureStatus.CANDIDATE] & camera & np.all(pairs >= 0, axis=1)
     overlap = np.full(len(pairs), np.nan)
-    overlap[judged] = _overlap(run, known, folder, pairs[judged])
+    overlap[judged] = _overlap(run, true, folder, pairs[judged])
     return {status: MatchViews.of(overlap[sets[ClosureScope.FLEET, status]]) for status in STAGES}
 
 
-def _overlap(run: Run, known: KnownPoses, folder: Path, pairs: Rows) -> FloatArray:
+def _overlap(run: Run, true: PoseTable, folder: Path, pairs: Rows) -> FloatArray:
     """Overlap of the views at the rows ``pairs`` (P, 2), shape (P,); NaN without recordings of like sensors."""
     rows, ends = np.unique(pairs, return_inverse=True)
     ranges_m: dict[int, Ranges] = {}
     sensors: set[tuple[LaserModel, CameraModel] | None] = set()
     for number, robot in enumerate(run.trajectories):
-        mine = rows[known.truth.robots[rows] == number]
+        mine = rows[true.robots[rows] == number]
         if len(mine):
-            row_of = dict(zip(known.truth.stamps[mine].round(STAMP_DIGITS).tolist(), mine.tolist(), strict=True))
+            row_of = dict(zip(true.stamps[mine].round(STAMP_DIGITS).tolist(), mine.tolist(), strict=True))
             sensors.add(_read_ranges(folder / robot, row_of, ranges_m))
     if len(sensors) != 1 or (both := sensors.pop()) is None or len(ranges_m) < len(rows):
         return np.full(len(pairs), np.nan)
     laser, camera = both
-    T_building_laser = se2.compose(known.truth.T_map_base[rows], laser.T_base_laser)
+    T_building_laser = se2.compose(true.T_map_base[rows], laser.T_base_laser)
     ranges = np.array([ranges_m[row] for row in rows.tolist()], np.float64)
     overlap = lidar_overlap(T_building_laser, ranges, laser, half_view_rad(camera))
     found: FloatArray = overlap[tuple(ends.reshape(pairs.shape).T)]

@@ -66,7 +66,7 @@ def codes(state, image, points):
 
 def test_only_the_layers_of_the_codes_change(encoder, start):
     settings = SMALL.model_copy(update={"encoder": encoder})
-    network = trained(start, LocalTrainingPlan(settings, 0, 3), encoder).network
+    network, _, _ = trained(start, LocalTrainingPlan(settings, 0, 3), encoder)
     changed = {name for name, tensor in network.state_dict().items() if not torch.equal(start[name], tensor)}
     assert changed
     assert changed <= layer_names(network, network.body.code_layers)
@@ -92,9 +92,9 @@ def test_training_brings_the_codes_of_a_point_together(light):
         first, second = (codes(state, image, points) for image, points in zip(OWN.images, PAIR.points, strict=True))
         return float(np.mean(first != second))
 
-    done = trained(light, LocalTrainingPlan(SMALL, 0, 20))
-    assert {"contrastive", "balance", "keypoints", "rehearsal"} == done.losses.keys()
-    assert distance(done.network.state_dict()) < 0.8 * distance(light)
+    done, losses, _ = trained(light, LocalTrainingPlan(SMALL, 0, 20))
+    assert {"contrastive", "balance", "keypoints", "rehearsal"} == losses.keys()
+    assert distance(done.state_dict()) < 0.8 * distance(light)
 
 
 def test_codes_of_pictures_that_the_robot_does_not_see_are_those_of_the_network_before(light):
@@ -104,7 +104,7 @@ def test_codes_of_pictures_that_the_robot_does_not_see_are_those_of_the_network_
     noisy = light | {"body.code_head.1.weight": layer + 2.0 * layer.std() * torch.randn(layer.shape, generator=noise)}
 
     def likeness(before):
-        state = trained(light, LocalTrainingPlan(SMALL, 0, 20), before=before).network.state_dict()
+        state = trained(light, LocalTrainingPlan(SMALL, 0, 20), before=before)[0].state_dict()
         return np.mean(codes(state, elsewhere, POINTS) == codes(noisy, elsewhere, POINTS))
 
     assert likeness(noisy) > likeness(light) + 0.04
@@ -112,12 +112,12 @@ def test_codes_of_pictures_that_the_robot_does_not_see_are_those_of_the_network_
 
 def test_rounds_continue_with_their_moments_and_from_where_the_first_began(light):
     inputs = CodeInputs()
-    whole = trained(light, LocalTrainingPlan(SMALL, 0, RAMP_STEPS + 1), inputs=inputs)
-    first = trained(light, LocalTrainingPlan(SMALL, 0, RAMP_STEPS), inputs=inputs)
-    after = LocalTrainingPlan(SMALL, RAMP_STEPS, 1, optimizer_state=first.optimizer_state)
-    second = trained(first.network.state_dict(), after, inputs=inputs, before=light)
-    expected = whole.network.state_dict()
-    assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())
+    whole, _, _ = trained(light, LocalTrainingPlan(SMALL, 0, RAMP_STEPS + 1), inputs=inputs)
+    first, _, moments = trained(light, LocalTrainingPlan(SMALL, 0, RAMP_STEPS), inputs=inputs)
+    after = LocalTrainingPlan(SMALL, RAMP_STEPS, 1, optimizer_state=moments)
+    second, _, _ = trained(first.state_dict(), after, inputs=inputs, before=light)
+    expected = whole.state_dict()
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in second.state_dict().items())
 
 
 def test_inputs_are_computed_again_only_if_the_layers_before_changed(light):

@@ -46,7 +46,7 @@ def test_a_run_learns(examples, tmp_path):
     longer = SMALL.model_copy(update={"steps": 40, "pairs": 2})
     figures = []
     TrainingRun(longer, tmp_path, PACE).train(
-        examples, examples[:1], on_progress=lambda status: figures.append(status.metrics)
+        examples, examples[:1], on_progress=lambda _step, _steps, metrics, _warnings: figures.append(metrics)
     )
     first, last = ([np.mean([row[name] for row in part]) for name in ("detector", "contrastive")]
                    for part in (figures[:3], figures[-3:]))  # fmt: skip
@@ -60,15 +60,15 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(examples, tmp_path):
     (tmp_path / "whole").mkdir()
     (tmp_path / "torn").mkdir()
 
-    def stop(status):
-        if status.step == 3:
+    def stop(step, *_):
+        if step == 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         TrainingRun(SMALL, tmp_path / "torn", PACE).train(examples, examples[:1], bits, stop)
     resumed = TrainingRun(SMALL, tmp_path / "torn", PACE)
     steps = []
-    torn = resumed.train(examples, examples[:1], bits, lambda status: steps.append(status.step))
+    torn = resumed.train(examples, examples[:1], bits, lambda step, *_: steps.append(step))
     assert steps == [4, 5, 6]
     assert torch.equal(weights(whole.train(examples, examples[:1], bits)), weights(torn))
 

@@ -36,17 +36,17 @@ def start():
 
 
 def test_two_legs_are_one_if_the_second_knows_the_first_ones_moments(examples, start):
-    whole = local_training(start, examples, LocalTrainingPlan(SMALL, 0, RAMP_STEPS + 3))
-    first = local_training(start, examples, LocalTrainingPlan(SMALL, 0, RAMP_STEPS))
-    halfway = first.network.state_dict()
-    second = local_training(
-        halfway, examples, LocalTrainingPlan(SMALL, RAMP_STEPS, 3, optimizer_state=first.optimizer_state)
+    whole, _, whole_state = local_training(start, examples, LocalTrainingPlan(SMALL, 0, RAMP_STEPS + 3))
+    first, _, first_state = local_training(start, examples, LocalTrainingPlan(SMALL, 0, RAMP_STEPS))
+    halfway = first.state_dict()
+    second, _, second_state = local_training(
+        halfway, examples, LocalTrainingPlan(SMALL, RAMP_STEPS, 3, optimizer_state=first_state)
     )
-    forgetful = local_training(halfway, examples, LocalTrainingPlan(SMALL, RAMP_STEPS, 3))
-    expected = whole.network.state_dict()
-    assert all(torch.equal(tensor, expected[name]) for name, tensor in second.network.state_dict().items())
-    assert all(torch.equal(tensor, whole.optimizer_state[name]) for name, tensor in second.optimizer_state.items())
-    assert any(not torch.equal(tensor, expected[name]) for name, tensor in forgetful.network.state_dict().items())
+    forgetful, _, _ = local_training(halfway, examples, LocalTrainingPlan(SMALL, RAMP_STEPS, 3))
+    expected = whole.state_dict()
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in second.state_dict().items())
+    assert all(torch.equal(tensor, whole_state[name]) for name, tensor in second_state.items())
+    assert any(not torch.equal(tensor, expected[name]) for name, tensor in forgetful.state_dict().items())
 
 
 def test_weights_that_make_training_diverge_are_said(examples, start):

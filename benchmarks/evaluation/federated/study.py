@@ -31,7 +31,7 @@ from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample, ViewPair
 from fcslam.learning.settings import TrainingSettings
 from fcslam.learning.stages import TrainingImages, keypoint_response, label_images, read_images
-from fcslam.learning.trainer import ExecutionOptions, TrainingProgress, TrainingRun
+from fcslam.learning.trainer import ExecutionOptions, TrainingRun
 from fcslam.records import FloatArray
 from fcslam.storage.files import replacing
 from fcslam.untrusted import read_arrays
@@ -188,8 +188,8 @@ def _spread(files: Sequence[ImageFile], most: int) -> list[ImageFile]:
 def _shared_inputs(study: Study, pairs: Sequence[ViewPair]) -> SharedInputs:
     training = study.federated.client_training()
 
-    def on_progress(progress: TrainingProgress) -> None:
-        study.on_progress("labels", progress.step, progress.steps)
+    def on_progress(step: int, steps: int, *_: object) -> None:
+        study.on_progress("labels", step, steps)
 
     device = torch.device(study.options.device)
     start = prepare_initial_weights(study.start, study.folder, training.encoder)
@@ -268,8 +268,8 @@ def _centrally(
     folder.mkdir(parents=True, exist_ok=True)
     quiet = replace(study.options, validate_every=training.steps, log_every=max(training.steps // 20, 1))
 
-    def on_progress(progress: TrainingProgress) -> None:
-        study.on_progress(f"{name}, seed {seed}", progress.step, progress.steps)
+    def on_progress(step: int, steps: int, *_: object) -> None:
+        study.on_progress(f"{name}, seed {seed}", step, steps)
 
     return TrainingRun(training, folder, quiet, state).train(examples, examples[:1], on_progress=on_progress)
 

@@ -11,13 +11,14 @@ from fcslam.cli.output import TRAINING, new_folder, notices, once_printer, print
 from fcslam.cli.training_options import TRAINING_OUTPUT, Start, compute_budget, require_training_libraries
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rich.console import Console
 
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.learning.network import KeypointNetwork
     from fcslam.learning.settings import TrainingSettings
     from fcslam.learning.stages import StageCallback
-    from fcslam.learning.trainer import TrainingProgress
 
 
 def train(
@@ -68,13 +69,13 @@ def _start_network(
 def _watch(display: "ProgressDisplay", console: "Console") -> "StageCallback":
     print_once = once_printer(console)
 
-    def watch(stage: str, status: "TrainingProgress") -> None:
-        known = [name for name in ("repeatability", "mma_3px") if name in status.metrics]
-        figures = "  ".join(f"{name} {status.metrics[name]:.3f}" for name in known)
-        display.show(stage, status.step, status.steps, figures)
-        if figures and status.step == status.steps:
-            print_once(f"{stage} {status.step}/{status.steps}  {figures}")
-        for alarm in status.collapse_warnings:
+    def watch(stage: str, step: int, steps: int, metrics: "Mapping[str, float]", warnings: tuple[str, ...]) -> None:
+        known = [name for name in ("repeatability", "mma_3px") if name in metrics]
+        figures = "  ".join(f"{name} {metrics[name]:.3f}" for name in known)
+        display.show(stage, step, steps, figures)
+        if figures and step == steps:
+            print_once(f"{stage} {step}/{steps}  {figures}")
+        for alarm in warnings:
             print_once(f"warning: {alarm}")
 
     return watch

@@ -6,7 +6,7 @@ the wanted bits.
 """
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -38,10 +38,10 @@ from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.objective import TeacherBits, teacher_bits
 from fcslam.learning.pairs import TrainingExample
 from fcslam.learning.settings import TrainingSettings
-from fcslam.learning.trainer import PROGRESS_FILE, ExecutionOptions, TrainingProgress, TrainingRun, read_curves
+from fcslam.learning.trainer import PROGRESS_FILE, ExecutionOptions, ProgressCallback, TrainingRun, read_curves
 
-StageCallback = Callable[[str, TrainingProgress], None]
-"""Called with the name of a stage and its progress."""
+StageCallback = Callable[[str, int, int, Mapping[str, float], tuple[str, ...]], None]
+"""Called with the name of a stage and its progress, as ``ProgressCallback``."""
 
 
 FoundImages = tuple[Sequence[tuple[ImageFile, GreyImage]], int]
@@ -126,7 +126,7 @@ def label_images(
     settings: TrainingSettings,
     labeller: Callable[[GreyImage], Response] | None,
     teacher: Path | None = None,
-    on_progress: Callable[[TrainingProgress], None] = lambda _progress: None,
+    on_progress: ProgressCallback = lambda *_: None,
 ) -> TrainingImages:
     """Label images that have no labels in ``cache`` yet.
 
@@ -154,7 +154,7 @@ def label_images(
                 )
         labels = _labels(image, cache / f"{file.name}.state", settings, labeller, taught)
         (held_out if is_held_out(file.name) else train).append(TrainingExample(image, labels, taught))
-        on_progress(TrainingProgress(index + 1, len(images), {}))
+        on_progress(index + 1, len(images), {}, ())
     return TrainingImages(train, held_out or train[:1], skipped)
 
 

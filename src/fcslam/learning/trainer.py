@@ -54,17 +54,9 @@ class ExecutionOptions:
     """Name of a device in torch."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrainingProgress:
-    """Progress of a stage of training."""
-
-    step: int
-    """Steps done."""
-    steps: int
-    metrics: Mapping[str, float]
-    """The latest losses and validation metrics."""
-    collapse_warnings: tuple[str, ...] = ()
-    """Warnings of the latest validation."""
+ProgressCallback = Callable[[int, int, Mapping[str, float], tuple[str, ...]], None]
+"""Called with the steps done, all steps, the latest losses and validation metrics, and the warnings of the latest
+validation."""
 
 
 class TrainingRun:
@@ -100,7 +92,7 @@ class TrainingRun:
         examples: Sequence[TrainingExample],
         held_out: Sequence[TrainingExample],
         bits: TeacherBits | None = None,
-        on_progress: Callable[[TrainingProgress], None] = lambda _progress: None,
+        on_progress: ProgressCallback = lambda *_: None,
     ) -> KeypointNetwork:
         """Train to the last step; returns the averaged network. ``bits`` are a teacher's, if the examples have one."""
         settings, options = self.settings, self.options
@@ -134,7 +126,7 @@ class TrainingRun:
                     self._log(found | {"alarms": float(len(warnings))})
                 if last or time.monotonic() - self._saved > options.checkpoint_every_s:
                     self._save()
-                on_progress(TrainingProgress(self.step, settings.steps, dict(metrics), warnings))
+                on_progress(self.step, settings.steps, dict(metrics), warnings)
         trained: KeypointNetwork = self.average
         return trained
 

@@ -6,7 +6,7 @@ A client's part of a federated round is some steps of it, from given weights (``
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 import torch
 from torch import Tensor, nn
@@ -148,14 +148,9 @@ class LocalTrainingPlan:
         return range(self.first_step, self.first_step + self.steps)
 
 
-class LocalTrainingResult(NamedTuple):
-    """The result of local training."""
-
-    network: KeypointNetwork
-    losses: dict[str, float]
-    """Means over the steps."""
-    optimizer_state: dict[str, Tensor]
-    """With which a later local training continues."""
+LocalTrainingResult = tuple[KeypointNetwork, dict[str, float], dict[str, Tensor]]
+"""The network; the means of its losses over the steps; and the state of the optimizer, with which a later local
+training continues."""
 
 
 def local_training(
@@ -209,4 +204,4 @@ def _descended(network: KeypointNetwork, losses_of: LossesOf, plan: LocalTrainin
     if not all(bool(torch.isfinite(value).all()) for value in state.values()):
         # Checked here, because whatever continues from this state would diverge.
         raise InputError("training diverged in the last step; lower the learning rate")
-    return LocalTrainingResult(network, {name: total / plan.steps for name, total in sums.items()}, state)
+    return network, {name: total / plan.steps for name, total in sums.items()}, state

@@ -8,7 +8,6 @@ from types import MappingProxyType
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.lab.evaluation.ground_truth import KnownPoses
 from fcslam.metrics.closures import (
     ClosureErrors,
     Mask,
@@ -98,9 +97,9 @@ FleetClosures = Mapping[tuple[ClosureScope, ClosureStatus, str], FleetClosureSco
 """Scores by scope, stage and name in ``CHANNELS``."""
 
 
-def score_closures(run: Run, known: KnownPoses) -> FleetClosures:
+def score_closures(run: Run, truth: PoseTable) -> FleetClosures:
     """Score all sets of closures. A closure is not covered if the true pose of an end is unknown."""
-    truth, sets, pairs = known.truth, closure_sets(run), closure_rows(run, known.truth)
+    sets, pairs = closure_sets(run), closure_rows(run, truth)
     T_i_j = np.array([closure.T_i_j for closure in run.closures]).reshape(-1, 3)
     true, is_known = np.full_like(T_i_j, np.nan), (pairs >= 0).all(axis=1)
     first, second = pairs[is_known].T

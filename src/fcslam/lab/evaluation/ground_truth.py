@@ -4,7 +4,6 @@ The true poses of a robot are a TUM file, `<folder>/<robot>/ground_truth.tum` or
 `<folder>/ground_truth/map.yaml`, in the format of ROS map_server.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -31,13 +30,9 @@ LEAST_COVERED = 0.5
 TRUE_MAP = Path("ground_truth", "map.yaml")
 
 
-@dataclass(frozen=True, slots=True)
-class KnownPoses:
-    """Estimated and true poses of a run, at the stamps at which the truth is known."""
-
-    estimate: PoseTable
-    truth: PoseTable
-    """True poses, row by row as in ``estimate``, in the frame of the truth, which counts as one map."""
+KnownPoses = tuple[PoseTable, PoseTable]
+"""Estimated poses of a run at the stamps at which the truth is known; and the true ones, row by row, in the frame of
+the truth, which counts as one map."""
 
 
 def truth_folder(run: Path, named: Path | None) -> Path:
@@ -60,10 +55,8 @@ def known_poses(run: Run, folder: Path) -> KnownPoses:
         true[rows] = _true_poses(trajectory, estimate.stamps[rows], folder)
     known = np.isfinite(true[:, 0])
     stamps, robots = estimate.stamps[known], estimate.robots[known]
-    return KnownPoses(
-        PoseTable.of(stamps, estimate.T_map_base[known], robots, estimate.maps[known]),
-        PoseTable.of(stamps, true[known], robots),
-    )
+    found = PoseTable.of(stamps, estimate.T_map_base[known], robots, estimate.maps[known])
+    return found, PoseTable.of(stamps, true[known], robots)
 
 
 def read_grid(path: Path) -> LabelledGrid:

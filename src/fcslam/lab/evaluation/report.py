@@ -92,8 +92,8 @@ class FleetReport:
 def evaluate_fleet(run: Path, truth: Path | None = None) -> FleetReport:
     """Evaluate the run folder ``run`` against the ground truth in a folder, by default that of ``truth_folder``."""
     opened, folder = open_run(run), truth_folder(run, truth)
-    known = known_poses(opened, folder)
-    alignments = {k: align(*_poses(known, known.estimate.maps == k)) for k in np.unique(known.estimate.maps).tolist()}
+    known = estimate, true = known_poses(opened, folder)
+    alignments = {k: align(*_poses(known, estimate.maps == k)) for k in np.unique(estimate.maps).tolist()}
     rng = np.random.default_rng(0)
     figures = {name: metric.value for name, metric in opened.metrics.items()}
     return FleetReport(
@@ -101,9 +101,9 @@ def evaluate_fleet(run: Path, truth: Path | None = None) -> FleetReport:
         robots=_robot_scores(opened, known, alignments, figures),
         maps=len(alignments),
         joins=_joins(opened, known),
-        within=relative_errors(near_pairs(known.truth, rng, across_robots=False), known.truth, known.estimate),
-        across=relative_errors(near_pairs(known.truth, rng, across_robots=True), known.truth, known.estimate),
-        closures=score_closures(opened, known),
+        within=relative_errors(near_pairs(true, rng, across_robots=False), true, estimate),
+        across=relative_errors(near_pairs(true, rng, across_robots=True), true, estimate),
+        closures=score_closures(opened, true),
         agreement=_agreement(run, folder, alignments),
         places={channel: _place_traffic(channel, figures) for channel in PLACE_CHANNELS},
     )
@@ -111,7 +111,8 @@ def evaluate_fleet(run: Path, truth: Path | None = None) -> FleetReport:
 
 def _poses(known: KnownPoses, rows: Mask) -> tuple[FloatArray, FloatArray]:
     """``T_truth_base`` and ``T_map_base`` (N, 3) of the rows that ``rows`` (M,) selects."""
-    return known.truth.T_map_base[rows], known.estimate.T_map_base[rows]
+    estimate, truth = known
+    return truth.T_map_base[rows], estimate.T_map_base[rows]
 
 
 def _robot_scores(
@@ -119,7 +120,7 @@ def _robot_scores(
 ) -> tuple[RobotScore, ...]:
     scores = []
     for number, trajectory in enumerate(run.trajectories.values()):
-        true, estimated = _poses(known, known.truth.robots == number)
+        true, estimated = _poses(known, known[1].robots == number)
         joint, alone = alignments[trajectory.map_index], align(true, estimated)
         scores.append(
             RobotScore(
@@ -138,7 +139,7 @@ def _robot_scores(
 
 
 def _joins(run: Run, known: KnownPoses) -> tuple[EvaluatedJoin, ...]:
-    tracks = [_poses(known, known.truth.robots == number) for number in range(len(run.trajectories))]
+    tracks = [_poses(known, known[1].robots == number) for number in range(len(run.trajectories))]
     robots = list(zip(run.trajectories.values(), tracks, strict=True))
     return tuple(
         EvaluatedJoin(a.robot, b.robot, *placement_error(track_a, track_b))

@@ -131,9 +131,9 @@ class ImageClient(RobotClient):
         start = weights_to_network(request.weights, training.encoder)
         state = self._state(request)
         examples = self._labelled(request.weights, training).train
-        trained = local_training(start.state_dict(), examples, self._plan(request, state))
-        self._keep(request, state, trained.optimizer_state)
-        return network_to_weights(trained.network), trained.losses
+        trained, losses, optimizer_state = local_training(start.state_dict(), examples, self._plan(request, state))
+        self._keep(request, state, optimizer_state)
+        return network_to_weights(trained), losses
 
     def evaluate(self, weights: Weights, training: TrainingSettings) -> dict[str, float]:
         """Repeatability and MMA at 3 px of the weights, shares in [0, 1], on pairs of images that are held out."""
@@ -176,9 +176,10 @@ class RevisitClient(RobotClient):
         if request.round_number == 0 or "first" not in state:
             state["first"] = dict(request.weights)
         before = weights_to_network(state["first"], encoder)
-        trained = train_codes(network.state_dict(), self.revisits, self.inputs, self._plan(request, state), before)
-        self._keep(request, state, trained.optimizer_state)
-        return network_to_weights(trained.network), trained.losses
+        plan = self._plan(request, state)
+        trained, losses, optimizer_state = train_codes(network.state_dict(), self.revisits, self.inputs, plan, before)
+        self._keep(request, state, optimizer_state)
+        return network_to_weights(trained), losses
 
 
 def robot_seed(robot: str, seed: int) -> int:
