@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
-from typing import Final, NamedTuple, Self
+from typing import Final, Self
 
 import numpy as np
 from pydantic import Field
@@ -155,13 +155,9 @@ def _status(matches: bool) -> ClosureStatus:
     return ClosureStatus.VERIFIED if matches else ClosureStatus.CANDIDATE
 
 
-class _Comparison(NamedTuple):
-    """Pairs of one stored place that are to be verified."""
-
-    i: KeyscanId
-    guesses: Sequence[Motion]
-    """Possible T_i_j; none: there is no match."""
-    predicted: bool
+_Comparison = tuple[KeyscanId, Sequence[Motion], bool]
+"""Pairs of one stored place that are to be verified: the place i; possible T_i_j (none: there is no match); and whether
+they are predicted."""
 
 
 class PlaceMatcher:
@@ -375,14 +371,14 @@ class PlaceMatcher:
         without the prediction, because the map may be wrong.
         """
         if place.channel is Channel.LIDAR:
-            return _Comparison(i, [Motion(T_i_j, NO_PRIOR, 0.0)], predicted=True)
-        far = self._far(i, place)
-        confirmed = [motion for motion in far.guesses if self._confirms(motion, T_i_j)]
-        return _Comparison(i, confirmed[:1], predicted=True) if confirmed else far
+            return i, [Motion(T_i_j, NO_PRIOR, 0.0)], True
+        far = _, guesses, _ = self._far(i, place)
+        confirmed = [motion for motion in guesses if self._confirms(motion, T_i_j)]
+        return (i, confirmed[:1], True) if confirmed else far
 
     def _far(self, i: KeyscanId, place: Place) -> _Comparison:
         """The comparison of a pair that is not predicted, by its motions from keypoints."""
-        return _Comparison(i, propose_motions(self._stored(i), place), predicted=False)
+        return i, propose_motions(self._stored(i), place), False
 
     def _confirms(self, motion: Motion, T_i_j: FloatArray) -> bool:
         off = se2.between(T_i_j, motion.T_a_b)
@@ -393,21 +389,15 @@ class PlaceMatcher:
     ) -> list[PlaceMatch]:
         """Verify the guesses of the comparisons; the best one of each counts."""
         comparisons = self._plausible(comparisons, place)
-        pairs = [
-            self._pair(comparison.i, place, guess, comparison.predicted)
-            for comparison in comparisons
-            for guess in comparison.guesses
-        ]
+        pairs = [self._pair(i, place, guess, predicted) for i, guesses, predicted in comparisons for guess in guesses]
         checks = iter(self._verify_pairs(pairs, VERIFICATION))
         matches: list[PlaceMatch] = []
-        for comparison in comparisons:
-            found = [next(checks) for _ in comparison.guesses]
+        for i, guesses, predicted in comparisons:
+            found = [next(checks) for _ in guesses]
             if found:
                 best = max(found, key=lambda check: (check.strict, check.worse.explained - check.worse.violation))
-                similarity = result.similarity_of(comparison.i, comparison.guesses[0].share)
-                matches.append(
-                    PlaceMatch.verified(comparison.i, place.id, place.channel, similarity, best, comparison.predicted)
-                )
+                similarity = result.similarity_of(i, guesses[0].share)
+                matches.append(PlaceMatch.verified(i, place.id, place.channel, similarity, best, predicted))
         return matches
 
     def _plausible(self, comparisons: Sequence[_Comparison], place: Place) -> list[_Comparison]:
@@ -416,17 +406,18 @@ class PlaceMatcher:
         Where many robots meet, most proposals are false. One count of points in free space takes a twentieth of the
         time of an alignment.
         """
-        proposed = [(n, guess) for n, c in enumerate(comparisons) if not c.predicted for guess in c.guesses]
+        doubted = [(n, guesses) for n, (_, guesses, predicted) in enumerate(comparisons) if not predicted]
+        proposed = [(n, guess) for n, guesses in doubted for guess in guesses]
         if len(proposed) <= MOST_DOUBTFUL:
             return list(comparisons)
-        violation = [self._violation(comparisons[n].i, place, guess.T_a_b) for n, guess in proposed]
+        violation = [self._violation(comparisons[n][0], place, guess.T_a_b) for n, guess in proposed]
         doubtful = [k for k in np.argsort(violation, kind="stable") if violation[k] > PLAUSIBLE_VIOLATION]
         left_out = set(doubtful[MOST_DOUBTFUL:])
         kept: dict[int, list[Motion]] = {n: [] for n, _ in proposed}
         for k, (n, guess) in enumerate(proposed):
             if k not in left_out:
                 kept[n].append(guess)
-        return [c._replace(guesses=kept[n]) if n in kept else c for n, c in enumerate(comparisons)]
+        return [(i, kept.get(n, guesses), predicted) for n, (i, guesses, predicted) in enumerate(comparisons)]
 
     def _violation(self, i: KeyscanId, place: Place, T_i_j: FloatArray) -> float:
         """Share of the new place's points that lie in free space of a stored one."""
