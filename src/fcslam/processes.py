@@ -6,6 +6,7 @@ the task sends. Only this module starts processes.
 """
 
 import ctypes
+import errno
 import json
 import logging
 import multiprocessing
@@ -207,6 +208,8 @@ def _needing_semaphores() -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOMEM):
+            raise
         raise InputError(
             f"/dev/shm: more than one process needs semaphores, which cannot be made there ({error}); "
             "mount it writable, with free space"

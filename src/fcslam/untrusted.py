@@ -9,6 +9,7 @@ import bz2
 import gzip
 import io
 import lzma
+import math
 import os
 import sqlite3
 import stat
@@ -127,15 +128,16 @@ def open_unpacked(path: Path) -> BinaryIO:
         unpacking = zstd.open(file, "rb")
     else:
         return file
-    return cast("BinaryIO", io.BufferedReader(_Limited(unpacking, file, size), _BUFFER_BYTES))
+    lines = math.inf if magic.startswith(ZSTD) else MOST_LINES + size  # of zstd may also be a bag, which has no lines
+    return cast("BinaryIO", io.BufferedReader(_Limited(unpacking, file, size, lines), _BUFFER_BYTES))
 
 
 class _Limited(io.RawIOBase):
     """Bytes of an unpacking stream, up to the limits for a compressed file of ``size`` bytes."""
 
-    def __init__(self, stream: Any, file: BinaryIO, size: int) -> None:
+    def __init__(self, stream: Any, file: BinaryIO, size: int, lines: float) -> None:
         self._stream, self._file, self._size = stream, file, size
-        self._unpacked, self._lines_left = 0, MOST_LINES + size
+        self._unpacked, self._lines_left = 0, lines
 
     def readable(self) -> bool:
         return True

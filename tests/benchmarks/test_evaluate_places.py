@@ -67,7 +67,7 @@ def test_a_stream_is_asked_before_each_place_is_added(described):
     index = PlaceIndex(WORDS, np.random.default_rng(1))
     for g in range(31):
         index.add(g, tour.gallery[g].descriptors)
-    answers = {found.id: found.similarity for found in index.query(tour.queries[31].descriptors, 100)}
+    answers = dict(index.query(tour.queries[31].descriptors, 100))
     np.testing.assert_allclose(scores[31, :12], [answers.get(g, 0.0) for g in range(12)])
 
 

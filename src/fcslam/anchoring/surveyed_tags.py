@@ -35,7 +35,7 @@ SCALE_ERROR: Final = 0.05
 SCALE_SIGMAS: Final = 5.0
 ALIGNED_M: Final = 0.5
 """A surveyed tag agrees with the map as it is if it lies within this of its place."""
-LARGEST_OFF_M: Final = ELSEWHERE_M
+LARGEST_OFF_M: Final = 0.15
 """A surveyed tag that is farther off in the solution does not count."""
 MOST_PAIRS: Final = 2000
 """Pairs of surveyed tags that propose a motion of the map; the longest baselines count."""

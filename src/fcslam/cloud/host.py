@@ -47,10 +47,10 @@ class FleetHost:
     def restore(self, state: State, edits: Sequence[Edit] = ()) -> None:
         """Take over a state of the same configuration, which had followed ``edits``."""
         settings = self._settings
-        self.fleet = Fleet.restored(
+        fleet = Fleet.restored(
             settings.fleet, settings.seed, state["fleet"], self._read, self._verify_pairs, in_force(edits)
         )
-        self.log, self.edits = from_state(PacketLog, state["log"]), tuple(edits)
+        self.fleet, self.log, self.edits = fleet, from_state(PacketLog, state["log"]), tuple(edits)
 
     def follow(self, edits: Sequence[Edit]) -> bool:
         """Follow further edits; True if the fleet is a new one, because the edits change what applied packets do."""

@@ -20,7 +20,6 @@ from fcslam.lidar.facing import SCANS_WATCHED, Contradiction, contradicted_facin
 from fcslam.lidar.own_body import MOST_PLACES, by_degree, scans_apart
 from fcslam.lidar.scan import rays_of
 from fcslam.records import FloatArray, LaserScan, frozen
-from fcslam.sources.point_clouds import LARGEST_BODY_M
 from fcslam.sources.returns import FloorLine
 
 FEWEST_PLACES: Final = SCANS_WATCHED
@@ -33,6 +32,8 @@ SAME: Final = 0.06
 LEAST_STRAIGHT, MOST_BEYOND = 0.9, 0.02
 """Shares: of the degrees that end at the line, and of the returns farther than ``BEYOND`` of it."""
 BEYOND: Final = 1.0 + 2.0 * SAME
+LEAST_M: Final = 1.0
+"""A nearer line belongs to the robot."""
 FARTHEST_SHARE: Final = 1.0 - MOST_BEYOND
 """Share of the ranges of a degree up to its end."""
 MOVING: Final = 0.3
@@ -76,7 +77,7 @@ def _line_ahead(scans: Iterable[LaserScan]) -> FloorLine | None:
         sector, cosines = (middle + offsets) % 360, np.cos(np.radians(offsets + 0.5))
         distance_m = float(np.median(ends_m[sector] * cosines))
         on_line = np.abs(ends_m[sector] * cosines - distance_m) < SAME * distance_m
-        if distance_m < LARGEST_BODY_M or on_line.mean() < LEAST_STRAIGHT:
+        if distance_m < LEAST_M or on_line.mean() < LEAST_STRAIGHT:
             continue
         away = ranges_m[:, sector] * cosines / distance_m
         away = away[np.isfinite(away)]

@@ -24,6 +24,8 @@ from fcslam.sources.point_clouds import LARGEST_BODY_M
 Heading = Annotated[float, Field(ge=-360.0, le=360.0)]
 Sectors = tuple[tuple[Heading, Heading], ...]
 Metres = Annotated[float, Field(ge=-20.0, le=20.0)]
+LEAST_AREA_M2: Final = 1e-4
+"""Smallest body."""
 HOW_TO_GIVE: Final = "give corners [[x, y], ...] in the order of the outline"
 
 
@@ -37,7 +39,7 @@ def _as_list(corners: object) -> object:
 
 def _is_polygon(corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
     twice_area = sum(x1 * y2 - x2 * y1 for (x1, y1), (x2, y2) in _sides(corners))
-    if corners and math.isclose(twice_area, 0.0, abs_tol=SAME_M**2):  # also of fewer than three corners
+    if corners and abs(twice_area) < 2.0 * LEAST_AREA_M2:  # also of fewer than three corners
         raise ValueError(f"no polygon, as it has no inside: {HOW_TO_GIVE}")
     return corners
 

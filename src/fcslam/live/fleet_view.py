@@ -149,6 +149,8 @@ class FleetView:
                 self.trouble, self._failures, wait_s = None, 0, POLL_S
             except FcslamError as error:  # the cloud is away, or older than this program
                 self.trouble, self._failures = str(error), self._failures + 1
+                if not isinstance(error, UnavailableError):  # after that one, the client asks the next address itself
+                    self._client.try_next()
                 wait_s = getattr(error, "retry_after_s", 0.0) + POLL_S + retry_delay_s(self._failures, self._rng)
 
     def _in_map(self) -> frozenset[str] | None:

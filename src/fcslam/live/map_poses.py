@@ -23,7 +23,7 @@ class CorrectedOdometry:
     def correct(self, correction: Correction) -> None:
         """Apply a correction unless a newer one was applied before. Any thread may call this."""
         if self.correction is None or correction.version > self.correction.version:
-            self.correction, self._arrived_s = correction, self._clock()
+            self._arrived_s, self.correction = self._clock(), correction  # others read without a lock
 
     def move(self, T_map_odom: FloatArray) -> None:
         """Move ``odom`` in the map of the newest correction, as shape (3,)."""

@@ -147,11 +147,16 @@ class Robot(LiveTracker):
             access = Server(server) if isinstance(server, str) else server
             sends = access is not None or wiring.transport is not None
             folder = _state_folder(state, sends, stack)
+            outbox = (
+                None  # it refuses the folder of another robot or process, so it is opened before anything is deleted
+            )
+            if sends and folder is not None:
+                outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", self.name, LARGEST_OUTBOX_BYTES)))
             keyframes = _keyframe_folder(folder, wiring.resumes) if wiring.keeps_keyframes else None
             self._start(executor, own_map, keyframes)
             self._frontend.change_floor(floor)
-            if sends and folder is not None:
-                self._uplink = self._connect(access, folder, wiring, own_map, stack)
+            if outbox is not None and folder is not None:
+                self._uplink = self._connect(access, outbox, folder, wiring, own_map, stack)
             warm_up_tracking(self._config.robot)
             self._stack = stack.pop_all()
 
@@ -367,9 +372,8 @@ class Robot(LiveTracker):
             ) from error
 
     def _connect(
-        self, access: Server | None, folder: Path, wiring: Wiring, follows_fleet: bool, stack: ExitStack
+        self, access: Server | None, outbox: Outbox, folder: Path, wiring: Wiring, follows_fleet: bool, stack: ExitStack
     ) -> Uplink:
-        outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", self.name, LARGEST_OUTBOX_BYTES)))
         transport, budget_kBps = wiring.transport, None
         if access is not None:
             shown, budget_kBps = Credentials(access.token, access.ca, access.certificate), access.budget_kBps

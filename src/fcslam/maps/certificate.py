@@ -49,7 +49,7 @@ OPEN_M: Final = CLOSURE_SIGMA_M
 """A motion is open if its weakest direction has a larger standard deviation."""
 OPEN_LENGTH_M: Final = 3.0 * CELL_M
 """Shorter open stretches are not named."""
-AGAIN_M: Final = FLOOR_M
+AGAIN_M: Final = 0.01
 AGAIN_PER_M: Final = 0.1 * AGAIN_M
 """Standard deviation of the motion that another drive between two places measures: constant, and by metre."""
 UNKNOWN_INFORMATION: Final = 1e-4

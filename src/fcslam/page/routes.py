@@ -9,6 +9,7 @@ from contextlib import suppress
 import uvicorn
 from fastapi import APIRouter, FastAPI, Request
 from fastapi.responses import Response
+from starlette.concurrency import run_in_threadpool
 
 from fcslam.page import ASSETS, MODULES
 from fcslam.page.report import ReadOnly, report_html, viewer_app
@@ -51,7 +52,7 @@ def report_router(state: ViewerState) -> APIRouter:
     async def get_report() -> Response:
         """The page as one file."""
         async with turn:
-            report = await report_html(state.mission)
+            report = await run_in_threadpool(lambda: asyncio.run(report_html(state.mission)))
         headers = {"Content-Disposition": 'attachment; filename="report.html"', "X-Content-Type-Options": "nosniff"}
         return Response(report, media_type="text/html", headers=headers)
 

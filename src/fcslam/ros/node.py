@@ -267,6 +267,7 @@ class RobotNode:
                 self.publish_map()
             except Exception as error:  # this thread also tells the state of the robot, so it must not end
                 self._tell_once(f"a map cannot be published: {error or type(error).__name__}")
+        self._save_maps()
 
     def diagnose(self) -> None:
         """Publish the state of the robot."""

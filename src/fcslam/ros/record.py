@@ -17,6 +17,9 @@ from fcslam.ros.network import RosNetwork
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.codec import full_name, typestore
 
+LARGEST_WAITING_BYTES = 256_000_000
+"""Most bytes that wait for a slow disk."""
+
 
 def record(
     network: RosNetwork,
@@ -32,7 +35,7 @@ def record(
     """
     from rosbags import rosbag2
 
-    inbox = Inbox()
+    inbox = Inbox(LARGEST_WAITING_BYTES)
     kinds = {**topics.kinds, CLOCK_TOPIC: CLOCK}
     inbox.subscribe(network, kinds, {}, time.time_ns)
     counts: Counter[str] = Counter()

@@ -4,6 +4,7 @@ psycopg is an extra of its own, so it is imported when a server is used.
 """
 
 import os
+import socket
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -24,6 +25,8 @@ RETRY_S: Final = 5.0
 """A server that is gone is looked for this long, before anything was changed."""
 ANSWER_S: Final = 10.0
 """A statement that takes longer fails: the server, or the way to it, is gone."""
+LOOK_EVERY_S: Final = 1.0
+"""How often connections in use are looked at."""
 MOST_CONNECTIONS: Final = 8
 """Most connections of one process to the server."""
 
@@ -42,13 +45,16 @@ class Postgres:
         self._name = name
         self._idle: list[_Connection] = []
         self._places = threading.Semaphore(MOST_CONNECTIONS)
-        self._is_closing = False
+        self._busy: dict[_Connection, float] = {}
+        """Since when each connection is in use."""
+        self._closing = threading.Event()
         with self._translated():
             self._idle.append(self._connected())
+        threading.Thread(target=self._watch, name="answers of PostgreSQL", daemon=True).start()
 
     def close(self) -> None:
         """Close all connections that nobody uses."""
-        self._is_closing = True
+        self._closing.set()
         while self._idle:
             self._idle.pop().close()
 
@@ -79,6 +85,7 @@ class Postgres:
             connection = None
             try:
                 connection = self._idle.pop() if self._idle else self._connected()
+                self._busy[connection] = time.monotonic()
                 connection.execute(begin.encode())
                 return connection
             except BaseException as error:
@@ -97,11 +104,6 @@ class Postgres:
             self.url,
             autocommit=True,
             connect_timeout=3,
-            # nothing else ends the wait for a server behind a broken network
-            tcp_user_timeout=int(1000 * (ANSWER_S + RETRY_S)),
-            keepalives_idle=int(ANSWER_S),
-            keepalives_interval=1,
-            keepalives_count=5,
             application_name=f"fcslam {self._name}",
             options=f"-c statement_timeout={ANSWER_S:.0f}s -c idle_in_transaction_session_timeout={RETRY_S:.0f}s "
             "-c client_min_messages=error",
@@ -110,13 +112,23 @@ class Postgres:
     def _give_back(self, connection: "_Connection") -> None:
         from psycopg.pq import TransactionStatus
 
+        self._busy.pop(connection, None)
         if not connection.closed and connection.info.transaction_status is not TransactionStatus.IDLE:
             with suppress(Exception):  # it is closed then
                 connection.execute("ROLLBACK")
-        if connection.closed or self._is_closing:
+        if connection.closed or self._closing.is_set():
             connection.close()
         else:
             self._idle.append(connection)
+
+    def _watch(self) -> None:
+        """Hang up on a server that does not answer: nothing else ends the wait for one that hangs."""
+        while not self._closing.wait(LOOK_EVERY_S):
+            now = time.monotonic()
+            for connection, since in list(self._busy.items()):
+                if now > since + ANSWER_S + RETRY_S:
+                    with suppress(Exception), socket.socket(fileno=os.dup(connection.fileno())) as line:
+                        line.shutdown(socket.SHUT_RDWR)
 
     @contextmanager
     def _translated(self) -> Iterator[None]:

@@ -129,9 +129,13 @@ class HttpClient:
                 response = self._client.request(method, path, content=content, headers=headers)
             return self._checked(response, passes)
         except UnavailableError:
-            self._urls.rotate(-1)
-            self._client.base_url = f"{self._url}/api/v1/"
+            self.try_next()
             raise
+
+    def try_next(self) -> None:
+        """Ask the next address of the cloud from now on."""
+        self._urls.rotate(-1)
+        self._client.base_url = f"{self._url}/api/v1/"
 
     def _checked(self, response: "httpx.Response", passes: Collection[int]) -> "httpx.Response":
         code = response.status_code
@@ -217,7 +221,9 @@ class HttpTransport(HttpClient):
             index = _detail(response).get("index")
             if isinstance(index, int) and 0 <= index < len(packets):
                 return HttpResponse(refusal=(index, self._reason(response)))
-            raise UnavailableError(self._reason(response))  # the batch was corrupted on its way
+            reason = self._reason(response)  # the batch was corrupted on its way
+            self.try_next()
+            raise UnavailableError(reason)
         try:
             return HttpResponse(
                 tuple(read_batch(response.content)),
@@ -225,7 +231,9 @@ class HttpTransport(HttpClient):
                 removed=response.headers.get(REMOVED_HEADER) == "1",
             )
         except (PacketError, ValueError) as error:
-            raise UnavailableError(f"{self._url}: the reply is broken ({error})") from error
+            broken = UnavailableError(f"{self._url}: the reply is broken ({error})")
+            self.try_next()
+            raise broken from error
 
     def detector(self, channel: Channel, version: str) -> bytes:
         """Download the file of an announced detector; raises as ``state``."""

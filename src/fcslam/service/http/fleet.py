@@ -20,7 +20,7 @@ from pydantic import Field
 import fcslam
 from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
 from fcslam.cloud.sessions import session_name
-from fcslam.errors import InputError
+from fcslam.errors import InputError, StoreError
 from fcslam.maps.palette import robot_colors
 from fcslam.records import Channel, ClosureStatus, Edit
 from fcslam.runs import ClosureRow, Run
@@ -118,6 +118,8 @@ def fleet_router(state: ViewerState) -> APIRouter:
         """Walls around both ends of a closure, laid on each other as it measured them."""
         try:
             picture = overlay_png(state.mission.store, run_of(state.mission), closure)
+        except StoreError:
+            raise
         except InputError as error:
             raise HTTPException(404, str(error)) from error
         return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=60"})

@@ -122,12 +122,12 @@ class MissionTables(RowStore):
             transaction = PostgresTransaction(connection)
             if self._lease is not None:
                 check_lease(transaction, self._lease)
+            yield transaction
             transaction.execute(  # a worker has to follow the rows; the time, once a minute, keeps it from resting
                 "UPDATE fcslam.missions SET is_wanted = true, touched = clock_timestamp() WHERE number = ?"
                 " AND (NOT is_wanted OR touched < clock_timestamp() - interval '60 seconds')",
                 (self._number,),
             )
-            yield transaction
             connection.execute("COMMIT")
 
     def rows(self, statement: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import InputError
+from fcslam.errors import InputError, StoreError
 from fcslam.mission.mission_store import MissionStore
 from fcslam.service.intake import AGENT_LEASE_S, Agents, Intake, SessionState, held_by_another
 from fcslam.service.mission_folder import MissionFolder
@@ -245,6 +245,8 @@ class SharedMissions:
     def _open_first(self) -> None:
         try:
             self.create(FIRST)
+        except StoreError:
+            raise
         except InputError:  # it is there, perhaps from another instance a moment ago
             self.open(FIRST)
 

@@ -7,7 +7,7 @@ import numpy as np
 from fcslam.records import CameraModel, Transform
 from fcslam.sources.bags.codec import COMPRESSED_IMAGE
 from fcslam.sources.bags.messages import header_of
-from fcslam.untrusted import image_size
+from fcslam.untrusted import LimitError, image_size
 
 MAX_IMAGE_BYTES = 1 << 25
 MAX_SIDE_PX = 1 << 14
@@ -102,6 +102,9 @@ def check_image(encoded: bytes, camera: CameraModel) -> None:
     """Raises ValueError if ``encoded`` is not an image of ``camera``."""
     if len(encoded) > MAX_IMAGE_BYTES:
         raise ValueError(f"an image has at most {MAX_IMAGE_BYTES} bytes")
-    width, height, _ = image_size(encoded)
+    try:
+        width, height, _ = image_size(encoded)
+    except LimitError as error:
+        raise ValueError(str(error)) from error
     if (width, height) != (camera.width, camera.height):
         raise ValueError(f"the image has {width} x {height} pixels, its camera {camera.width} x {camera.height}")

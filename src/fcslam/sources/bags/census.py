@@ -48,7 +48,7 @@ from fcslam.sources.bags.messages import (
 )
 from fcslam.sources.bags.records import MessagePlace, StoredMessage
 from fcslam.sources.bags.transforms import Link, TransformTree, differ
-from fcslam.untrusted import ZSTD, unpack
+from fcslam.untrusted import ZSTD, LimitError, unpack
 
 _LATEST_NS: Final = int(np.iinfo(np.int64).max)
 """Of a damaged file, some times are larger."""
@@ -256,7 +256,10 @@ def _counted(topic: TopicCensus, message: StoredMessage, ros1: bool) -> Content 
 
 def _decode(payload: bytes, kind: str, ros1: bool) -> Any:
     if not ros1 and payload.startswith(ZSTD):
-        payload = unpack(payload, "zstd")
+        try:
+            payload = unpack(payload, "zstd")
+        except LimitError as error:
+            raise ValueError(str(error)) from error
     return MessageCodec(ros1).decode(payload, kind)
 
 

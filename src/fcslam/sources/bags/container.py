@@ -65,8 +65,10 @@ def _files_in(folder: Path) -> list[Path]:
 
 
 def _own_files(folder: Path) -> list[Path]:
-    names = [path for path in folder.iterdir() if Path(path.name.removesuffix(_ZSTD_SUFFIX)).suffix in _SUFFIXES]
-    return sorted(names)
+    shown = {path.name for path in folder.iterdir() if not path.name.startswith(".")}
+    bags = [name for name in sorted(shown) if Path(name.removesuffix(_ZSTD_SUFFIX)).suffix in _SUFFIXES]
+    is_unpacked = {name + _ZSTD_SUFFIX for name in shown}
+    return [folder / name for name in bags if name not in is_unpacked]
 
 
 class BagPart:
@@ -87,7 +89,7 @@ class BagPart:
         self._remedy = next((_REMEDIES[magic] for magic in _REMEDIES if head.startswith(magic)), "")
         if not self._remedy:
             raise SourceError(
-                f"{path}: the whole bag is compressed; unpack it first, as by `gunzip`, `xz -d` or `zstd -d`"
+                f"{path}: no bag, or a compressed one; unpack it first, as by `gunzip`, `xz -d` or `zstd -d`"
             )
         self.file: RecordFile | DatabaseFile = (
             DatabaseFile(path) if head == SQLITE_MAGIC else RecordFile(path, head.startswith(ROS1_MAGIC))

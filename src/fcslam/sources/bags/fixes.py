@@ -7,7 +7,6 @@ from fcslam.records import GnssFix
 from fcslam.sources.bags.codec import FIX
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import header_of
-from fcslam.sources.bags.rig import FARTHEST_SENSOR_M
 from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, mounting
 from fcslam.sources.faults import Fault
@@ -20,6 +19,8 @@ FIX_INTERVAL_S: Final = 0.9
 HIGHEST_M: Final = 1e5
 """A larger altitude is unknown."""
 LARGEST_SIGMA_M: Final = 1e4
+FARTHEST_ANTENNA_M: Final = 50.0
+"""Largest distance of the antenna from the robot's base."""
 
 
 def fix_topics(robot: BagRobot) -> list[Topic]:
@@ -61,6 +62,6 @@ def _antenna(tree: TransformTree, base_frame: str, frame: str) -> tuple[float, f
         x, y, _ = mounting(tree.fixed(base_frame, frame)).T_base_laser
     except NoTransformError:
         return 0.0, 0.0
-    if not math.hypot(x, y) <= FARTHEST_SENSOR_M:
+    if not math.hypot(x, y) <= FARTHEST_ANTENNA_M:
         raise ValueError(f"the antenna is {math.hypot(x, y):g} m from the robot")
     return x, y

@@ -204,13 +204,13 @@ class DatabaseFile:
             self.topics = {
                 number: (name, _kind(kind, encoding))
                 for number, name, kind, encoding in database.execute(
-                    "SELECT id, name, type, serialization_format FROM topics"
+                    "SELECT id, name, type, serialization_format FROM topics WHERE typeof(name) = 'text'"
                 )
             }
             for row, topic, time_ns, payload in database.execute(
                 "SELECT id, topic_id, timestamp, data FROM messages ORDER BY id"
             ):
-                if not (isinstance(payload, bytes) and isinstance(time_ns, int)):
+                if not (isinstance(row, int) and isinstance(payload, bytes) and isinstance(time_ns, int)):
                     raise DamageError(f"message {row} is not bytes with a time")
                 if topic in self.topics:
                     yield StoredMessage(*self.topics[topic], time_ns, payload, (-1, row, 0))
