@@ -57,8 +57,7 @@ def cloud():
 def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     state = tmp_path / "state"
     (tmp_path / "token").write_text("s3cret\n")
-    arguments = ["--server", cloud.url, "--state", str(state), "--credentials", str(tmp_path)]
-    assert main(["play", str(log), *arguments]) == 0
+    assert main(["play", str(log), "--server", cloud.url, "--state", str(state), "--credentials", str(tmp_path)]) == 0
     assert {headers["Authorization"] for _, _, headers, _ in cloud.requests} == {"Bearer s3cret"}
     out, err = capsys.readouterr()
     stored = [decode(data) for data in cloud.cloud.stored.values()]
@@ -70,8 +69,10 @@ def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     assert (state / "outbox.sqlite").stat().st_mode & 0o077 == 0
     assert main(["play", str(log), "--server", cloud.url, "--state", str(state), "--resume"]) == 0
     assert len(cloud.cloud.stored) == len(stored), "nothing twice"
-    assert main(["play", f"bob={log}", "--server", cloud.url, "--state", str(state)]) == 2
+    (state / "keyframes").mkdir()
+    assert main(["play", f"bob={log}", "--server", cloud.url, "--state", str(state), "--learn"]) == 2
     assert "belongs to robot 'alice'" in capsys.readouterr().err
+    assert (state / "keyframes").exists()
 
 
 @pytest.mark.parametrize(

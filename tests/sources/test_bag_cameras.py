@@ -160,17 +160,18 @@ def test_distortion_is_said(tmp_path):
 
 
 def test_an_image_that_is_none_is_left_out_and_counted(tmp_path):
-    count = iter(range(10))
+    count, jpeg = iter(range(10)), bytearray(cv2.imencode(".jpg", np.zeros((6, 8), np.uint8))[1])
+    size = jpeg.index(b"\xff\xc0") + 5
+    jpeg[size : size + 4] = b"\xff\xff\xff\xff"  # 65535 x 65535 pixels
 
     def change(topic, kind, message):
         if topic == "/camera/image_raw/compressed":
-            at = next(count)
-            message.data = np.frombuffer({2: b"no image", 3: png(9, 6)}.get(at, png()), np.uint8)
+            message.data = np.frombuffer({2: b"no image", 3: png(9, 6), 4: jpeg}.get(next(count), png()), np.uint8)
         return topic, kind, message
 
     source = open_source(rewritten(tmp_path, change))
-    assert len(images(source)) == 3
-    assert (source.faults[Fault.BROKEN_IMAGE].count, source.faults[Fault.BROKEN_IMAGE].first_line) == (2, 3)
+    assert len(images(source)) == 2
+    assert (source.faults[Fault.BROKEN_IMAGE].count, source.faults[Fault.BROKEN_IMAGE].first_line) == (3, 3)
     assert source.survey().scan_count == 5
 
 
