@@ -22,7 +22,7 @@ from fcslam.cli import (
     serve,
     show,
     simulate,
-    small_commands,
+    tool_commands,
     train,
 )
 from fcslam.cli import localize as localization
@@ -73,13 +73,13 @@ COMMANDS: dict[str, tuple[str, Callable[..., None] | typer.Typer]] = {
     "evaluate": (STUDY, evaluate.app),
     "tools": (STUDY, tools),
     "tools simulate": (RECORDINGS, simulate.simulate),
-    "tools changes": (RECORDINGS, small_commands.changes),
-    "tools config": (SETUP, small_commands.config),
-    "tools certificates": (SETUP, small_commands.certificates),
+    "tools changes": (RECORDINGS, tool_commands.changes),
+    "tools config": (SETUP, tool_commands.config),
+    "tools certificates": (SETUP, tool_commands.certificates),
     "tools warm-up": (SETUP, warming.warm_up),
     "tools train": (LEARNING, train.train),
     "tools federate": (LEARNING, federate.federate),
-    "tools extract": (LEARNING, small_commands.extract),
+    "tools extract": (LEARNING, tool_commands.extract),
 }
 """Group in the help, and function, of each command. A typer has commands and examples of its own."""
 EXAMPLES = """\

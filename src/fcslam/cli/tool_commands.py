@@ -1,4 +1,4 @@
-"""The small commands of `fcslam tools`: configuration, changes of a building, features of images, credentials."""
+"""Short commands of `fcslam tools`: configuration, changes of a building, features of images, credentials."""
 
 from pathlib import Path
 from typing import Annotated
