@@ -1,6 +1,7 @@
 """Conversion between records and protobuf messages, with writing and reading side by side."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from fcslam.records import (
 )
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire import limits
-from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, PacketKind
+from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, PacketKind
 from fcslam.wire.quantisation import (
     dequantise,
     dequantise_keypoints,
@@ -234,6 +235,19 @@ def _write_detector_update(update: DetectorUpdate) -> pb.DetectorUpdate:
 
 def _read_detector_update(message: pb.DetectorUpdate, envelope: pb.Packet) -> DetectorUpdate:
     return DetectorUpdate(envelope.robot, DetectorFile(read_channel(message.channel), **_values(message, _OF_FILE)))
+
+
+def received(body: Body) -> Body:
+    """A record as its receiver reads it."""
+    match body:
+        case Constraint() | TagSighting():
+            return replace(body, information=unpack_information(pack_information(body.information)))
+        case Place():
+            codes = quantise_keypoints(body.keypoints)
+            order = ascending(codes)
+            descriptors = frozen(body.descriptors[order], np.uint8)
+            return replace(body, keypoints=dequantise_keypoints(codes[order]), descriptors=descriptors)
+    return body
 
 
 def _values(source: object, names: tuple[str, ...]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Encoding and decoding of packets (format: docs/reference/wire.md)."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from google.protobuf.message import DecodeError
@@ -8,7 +9,7 @@ from fcslam.errors import PacketError
 from fcslam.records import CODE_BYTES, Channel, Place
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire import limits
-from fcslam.wire.bodies import CODECS, KIND_OF_TYPE, read_channel
+from fcslam.wire.bodies import CODECS, KIND_OF_TYPE, read_channel, received
 from fcslam.wire.checks import check, check_name
 from fcslam.wire.messages import Packet, PacketKind
 
@@ -59,8 +60,7 @@ class SizedPacket(NamedTuple):
 
 def measure(packet: Packet) -> SizedPacket:
     """Return the packet as a receiver reads it, and its bytes."""
-    data = encode(packet)
-    return SizedPacket(decode(data), data)
+    return SizedPacket(replace(packet, body=received(packet.body)), encode(packet))
 
 
 def decode(data: bytes) -> Packet:
