@@ -54,7 +54,7 @@ A running service answers these HTTP requests for its state, maps and edits. `ma
 | 403 | the role or the robot does not match |
 | 404 | there is no such thing |
 | 409 | two agents with one name, two packets with one number, a mission that exists, or an edit that cannot be undone |
-| 413 | the request exceeds 1 MiB, or 32 MiB decompressed |
+| 413 | the request exceeds 1 MiB |
 | 429 | too many requests; `Retry-After` says when to try again |
 | 503 | the service is stopping, or it is not ready |
 | 507 | the disk is full; the service writes a requested result when there is room again |

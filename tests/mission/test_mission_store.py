@@ -123,9 +123,9 @@ def test_a_full_disk_is_told_and_what_was_there_stays(tmp_path):
 def test_what_another_process_wrote_is_seen(store, place):
     other = place()
     other.put([packet()], 0.0)
-    other.refuse("a", 0, 0, "no good")
+    other.refuse([("a", 0, 0, "no good")])
     assert store.refusals("a") == [(0, 0, "no good")]
-    assert store.packet("a", 0, 0).refusal == "no good"
+    assert store.packets([("a", 0, 0)])["a", 0, 0].refusal == "no good"
     other.close()
 
 
@@ -276,11 +276,11 @@ def test_the_time_for_a_packet_does_not_grow_with_the_mission(tmp_path):
     store.put([packet(sequence=k) for k in range(15, 25)], 2.0)
     store.progress(40, [correction("a", 1.0)])
     store.arrivals(30, 10)
-    store.packet("a", 0, 3)
+    store.packets([("a", 0, 3)])
     store.correction("a", 0)
     store.newest_hello("a", 0)
     store.newest_keyscan("a", 0)
-    store.refusal_count("a")
+    store.refused("a")
     store.envelopes(after=30)
     store.traffic_since(30, 10)
     store.close()

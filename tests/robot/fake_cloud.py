@@ -46,7 +46,7 @@ class FakeCloud:
 
     def state(self):
         epochs = {epoch for epoch, _ in (*self.stored, *self.refused)}
-        return CloudState({epoch: self.next(epoch) for epoch in epochs}, dict(self.refused))
+        return CloudState({epoch: self.next(epoch) for epoch in epochs}, dict(self.refused), len(self.refused))
 
     def next(self, epoch):
         sequence = 0

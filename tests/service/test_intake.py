@@ -12,9 +12,10 @@ from fcslam.cloud.replies import SessionCorrection
 from fcslam.errors import InputError, PacketConflictError, PacketError
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Correction, frozen
-from fcslam.service.intake import AGENT_LEASE_S, BusyError, Intake, RefusedPacketError
+from fcslam.service.intake import AGENT_LEASE_S, PACKET_BYTES, BusyError, Intake, RefusedPacketError
+from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.batches import read_batch, write_batch
-from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS
+from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS, MAXIMUM_PACKET_BYTES, VERSION
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode
 from tests.scripted import rectangle, stream
@@ -107,15 +108,28 @@ def test_of_many_sessions_the_later_ones_wait(desk):
 
 def test_of_many_packets_the_later_ones_wait(desk):
     small(desk, limits=ClaimLimits(packets_per_s=0.2))
-    for _ in range(MAXIMUM_BATCH_PACKETS // len(DATA)):
+    most = MAXIMUM_BATCH_PACKETS * MAXIMUM_PACKET_BYTES // PACKET_BYTES
+    for _ in range(most // len(DATA)):
         desk.take(*DATA)  # a packet that comes again counts again
-    left = MAXIMUM_BATCH_PACKETS % len(DATA)
-    with pytest.raises(BusyError, match=r"0\.2 packets per second") as busy:
+    left = most % len(DATA)
+    with pytest.raises(BusyError, match=r"0\.2 packets of 8192 bytes per second") as busy:
         desk.take(*DATA[: left + 1])
     assert busy.value.retry_after_s == pytest.approx(5.0)
     desk.now += 5.0
     assert desk.take(*DATA[: left + 1]) == [Acknowledgement("a", 0, len(DATA) - 1)]
     desk.take(robot="b")
+
+
+def test_what_unpacks_to_much_counts_for_that_before_it_is_unpacked(desk):
+    """Places that announce 2,048 keypoints in a few bytes: about 80 kB each."""
+    body = {"number": 0, "channel": 1, "count": 2048, "detector_version": "test-1"}
+    packets = [pb.Packet(version=VERSION, robot="a", sequence=k, place=body).SerializeToString() for k in range(1000)]
+    assert sum(map(len, packets)) < 50_000
+    small(desk, limits=ClaimLimits(packets_per_s=1.0))
+    with pytest.raises(RefusedPacketError):
+        desk.take(*packets)
+    with pytest.raises(BusyError, match="packets of"):
+        desk.take(*packets[500:])
 
 
 def test_a_correction_is_told_once(desk):
@@ -174,35 +188,51 @@ def test_a_second_agent_waits_until_the_first_is_silent_long_enough(desk):
         desk.take(DATA[3], agent="x")
 
 
-def test_what_cannot_be_taken_in_now_has_to_wait(desk):
-    small(desk, longest_queue=4)
+def other_robot(count):
+    return [encode(packet) for packet in stream("b", rectangle(9), start_s=0.0)][:count]
+
+
+@pytest.mark.parametrize(("applied", "queued"), [(0, {}), (1, {"a": 4}), (1, {"b": 1, "a": 4})])
+def test_of_a_robot_whose_packets_wait_for_the_worker_no_more_are_taken(desk, applied, queued):
+    """Whether the worker has read them, or not yet."""
+    small(desk, most_waiting=3)
+    desk.take(*other_robot(1), robot="b")
     desk.take(*DATA[:5])
-    with pytest.raises(BusyError, match="5 packets"):
+    desk.store.progress(applied, [], queued)
+    with pytest.raises(BusyError, match=f"{5 - len(queued) // 2} packets have not taken effect yet"):
         desk.take(DATA[5])
-    desk.store.progress(3, [])
+    assert desk.take(*other_robot(4), robot="b") == [Acknowledgement("b", 0, 3)], "another robot does not wait"
+    assert desk.take() == [Acknowledgement("a", 0, 4)], "and it may ask"
+    desk.store.progress(3, [], {"b": 1, "a": 1})
     assert desk.take(DATA[5]) == [Acknowledgement("a", 0, 5)]
 
 
-def test_a_packet_far_ahead_has_to_wait_for_those_before_it(desk):
-    small(desk, most_early=3)
-    with pytest.raises(BusyError, match="send packet 0 first"):
-        desk.take(DATA[4])
-    assert desk.take(DATA[3]) == []
-    assert desk.intake.waiting_count() == 1
-
-
 def test_packets_that_wait_for_one_before_them_keep_out_neither_it_nor_other_robots(desk):
-    small(desk, longest_queue=20, most_early=6)
+    small(desk, most_waiting=6)
     in_epoch = [encode(replace(p, epoch=1)) for p in PACKETS[1:9] if not isinstance(p.body, Hello)]
     desk.take(*DATA[1:5])
     desk.take(*in_epoch[:2])
     for data in (DATA[5:6], in_epoch[2:3]):
         with pytest.raises(BusyError, match="send packet 0 of epoch"):
             desk.take(*data)
-    other = [encode(packet) for packet in stream("b", rectangle(9), start_s=0.0)]
-    assert desk.take(*other[:5], robot="b") == [Acknowledgement("b", 0, 4)]
+    assert desk.take(*other_robot(5), robot="b") == [Acknowledgement("b", 0, 4)]
     assert desk.take(DATA[0])[0] == Acknowledgement("a", 0, 4)
     assert desk.take(DATA[5])[0] == Acknowledgement("a", 0, 5)
+
+
+def test_of_a_robot_with_too_many_refused_packets_no_more_are_stored_and_a_line_comes_before(desk, caplog):
+    small(desk, most_refused_bytes=3 * PACKET_BYTES)
+    for number in range(1, 4):
+        with pytest.raises(RefusedPacketError):
+            desk.take(DATA[number] + b"\xc0\x3e\x01")
+        assert len(caplog.records) == (number == 3)
+    with pytest.raises(BusyError, match="3 packets were refused"):
+        desk.take(DATA[0])
+    (line,) = caplog.records
+    assert "a: 2 packets were refused" in line.getMessage()
+    assert len(desk.store.envelopes()) == 3
+    assert desk.take(*other_robot(2), robot="b") == [Acknowledgement("b", 0, 1)]
+    assert desk.take() == [], "it may ask"
 
 
 @pytest.mark.parametrize("name", ["a+1", "a+12"])

@@ -23,11 +23,11 @@ from fcslam.runs import open_run
 from fcslam.service.joint_maps import read_joint_maps
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import PROGRESS
-from fcslam.service.worker import AT_ONCE, MOST_CRASHES, QUALITY_EVERY_S, SNAPSHOT_EVERY_S, Worker
+from fcslam.service.worker import AT_ONCE, MOST_CRASHES, QUALITY_EVERY_S, SNAPSHOT_EVERY_S, CrashLog, Worker
 from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, read_label
-from tests.scripted import closures, rectangle, stream
+from tests.scripted import closures, motion, rectangle, stream
 from tests.service.inline import InlineTask
 from tests.small_fleet import in_order
 
@@ -290,7 +290,7 @@ def test_a_packet_that_ends_worker_after_worker_is_refused_and_the_mission_goes_
     bad = next(k for k, packet in enumerate(packets) if k > 70 and isinstance(packet.body, Place))
     reference = Cloud(tmp_path / "reference")
     reference.put(packets)
-    reference.store.refuse(packets[bad].robot, 0, packets[bad].sequence, "beforehand")
+    reference.store.refuse([(packets[bad].robot, 0, packets[bad].sequence, "beforehand")])
     expected = content(reference.finalize())
     reference.store.close()
 
@@ -359,7 +359,7 @@ def test_a_packet_refused_while_it_waits_is_not_applied_after_a_restart(cloud):
     cloud.work()
     cloud.now += 60.0
     cloud.work()
-    cloud.store.refuse("a", 0, packets[-1].sequence, "by hand")
+    cloud.store.refuse([("a", 0, packets[-1].sequence, "by hand")])
     applied = []
     cloud.restart(hosts(applied.append))
     cloud.put(packets[-2:-1])
@@ -554,3 +554,63 @@ def test_a_result_that_fails_stops_nothing(cloud):
     cloud.restart()
     assert len(cloud.finalize().trajectories) == 2
     assert cloud.folder.live.exists()
+
+
+def flood(robot, count, start_s):
+    """A robot of which all but the first packets are constraints of keyscans that do not exist."""
+    first = stream(robot, POSES[:2], start_s)
+    wrong = [motion(robot, 10**6 + k, 10**6 + k + 1, POSES[1]) for k in range(count)]
+    return [*first, *(Packet(robot, 0, len(first) + k, start_s + 9.0, body) for k, body in enumerate(wrong))]
+
+
+def test_a_robot_that_floods_delays_no_other_and_the_result_is_the_same(cloud):
+    cloud.put(flood("c", 9 * AT_ONCE, start_s=-500.0))
+    cloud.put(stream("a", POSES[:5], start_s=0.0))
+    applied = []
+    cloud.restart(hosts(lambda packet: applied.append(packet.robot)))
+    cloud.tick = 0.0
+    cloud.worker.step()
+    assert applied == ["c"] * AT_ONCE + ["a"] * len(stream("a", POSES[:5], 0.0)), "in one step, behind a part of c's"
+    applied_count, waiting = cloud.store.backlog()
+    assert waiting == {"c": len(flood("c", 9 * AT_ONCE, 0.0)) - AT_ONCE}
+    assert applied_count == len(applied)
+    live = content(cloud.finalize())
+    cloud.restart()
+    assert content(cloud.finalize()) == live, "in the order of time"
+
+
+def test_refusals_are_stored_together_and_outlive_the_worker(cloud):
+    cloud.put(flood("c", 2 * AT_ONCE, start_s=0.0))
+    cloud.tick = 0.0
+    cloud.worker.step()
+    stored = cloud.store.refused("c").count
+    assert stored > AT_ONCE // 2, "with how far the worker is, in one transaction"
+    cloud.tick = 1.0
+    cloud.restart()
+    cloud.work()
+    assert cloud.store.refused("c").count == 2 * AT_ONCE
+    assert len(cloud.store.refusals("c")) == 100, "the last ones, however many there are"
+
+
+def test_a_worker_goes_on_within_a_queue(cloud):
+    packets = flood("c", 9 * AT_ONCE, start_s=0.0)
+    cloud.put(packets)
+    cloud.tick = 0.0
+    cloud.worker.step()
+    cloud.now += SNAPSHOT_EVERY_S
+    cloud.worker.step()
+    assert cloud.folder.snapshot.exists(), "although packets wait"
+    applied, cloud.tick = [], 1.0
+    cloud.restart(hosts(lambda packet: applied.append(packet.sequence)))
+    cloud.work()
+    assert applied == list(range(AT_ONCE, len(packets))), "no packet twice"
+    assert cloud.store.refused("c").count == 9 * AT_ONCE
+
+
+def test_a_task_that_a_worker_survived_is_no_longer_suspect(tmp_path):
+    for _ in range(MOST_CRASHES - 1):
+        CrashLog(tmp_path / "task").begin("packet 1 of a")
+    log = CrashLog(tmp_path / "task")
+    for task in ("packet 1 of a", "packet 2 of a", "packet 1 of a"):  # an edit lets packets be applied again
+        log.begin(task)
+    assert not CrashLog(tmp_path / "task").is_fatal("packet 1 of a")

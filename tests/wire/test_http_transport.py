@@ -1,5 +1,6 @@
 """HTTP one request at a time: what goes over the wire, and what each answer means."""
 
+import gzip
 import json
 from datetime import UTC, datetime
 
@@ -110,6 +111,17 @@ def test_another_server_is_no_cloud(cloud, transport, body):
     cloud.canned.append((200, {}, body))
     with pytest.raises(CloudError, match="does not come from an fcslam cloud"):
         transport.state()
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_reply_without_an_end_is_read_no_further_than_the_limit(cloud, transport, packed):
+    transport.most_reply_bytes = 1000
+    for size in (1000, 1001):
+        answer = ({"Content-Encoding": "gzip"}, gzip.compress(bytes(size))) if packed else ({}, bytes(size))
+        cloud.canned.append((200, *answer))
+    assert transport.detector(Channel.CAMERA, "v1") == bytes(1000)
+    with pytest.raises(CloudError, match="over 1000 bytes"):
+        transport.detector(Channel.CAMERA, "v1")
 
 
 def test_where_an_instance_does_not_answer_the_next_one_is_asked_and_stays(cloud):

@@ -25,7 +25,6 @@ from fcslam.learning.settings import DETECTOR
 from fcslam.processes import Child, module_command
 from fcslam.service.audit_log import audit_file, audit_table
 from fcslam.service.http.authentication import Authenticator, read_tokens
-from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
 from fcslam.service.http.state import EventStream, ServiceState
 from fcslam.service.mission_folder import MissionFolder
@@ -60,9 +59,7 @@ def own_state(data: Path, authenticator: Authenticator, config: CloudConfig, wor
         return Supervisor(folder.name, lambda: start_worker(task), events.publish)
 
     missions = Missions(data, config, time.monotonic, time.time, launch)
-    return ServiceState(
-        missions, authenticator, RateLimit(time.monotonic), events, audit_file(data / "audit.jsonl"), data / "learning"
-    )
+    return ServiceState(missions, authenticator, events, audit_file(data / "audit.jsonl"), data / "learning")
 
 
 def shared_state(
@@ -95,7 +92,7 @@ def shared_state(
         events = EventStream(lambda: missions.open_mission.name)
         missions = SharedMissions(data, config, server, name, int(limit), launch, events.publish)
         missions.closing = opened.pop_all().close
-        return ServiceState(missions, authenticator, RateLimit(time.monotonic), events, audit)
+        return ServiceState(missions, authenticator, events, audit)
 
 
 def reload_on_hangup(state: ServiceState, tokens: Path | None) -> None:

@@ -51,7 +51,7 @@ def _read(client: MapClient, server: str) -> Run:
         files = {
             f"{map_stem(one.number)}.{suffix}": content
             for one in served
-            for suffix, content in (("yaml", client.description(one.number)), ("pgm", client.image(one.number)))
+            for suffix, content in (("yaml", client.file(one.number, "yaml")), ("pgm", client.file(one.number, "pgm")))
         }
         if all(_fits(one, files, server) for one in served):
             poses: tuple[FloatArray, FloatArray] = (

@@ -5,7 +5,7 @@ Packets are numbered by **arrival**. The order in which they take effect follows
 """
 
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,9 +29,13 @@ from fcslam.wire.messages import Hello, PacketKind
 from fcslam.wire.packets import Label, decode
 
 _Body = TypeVar("_Body", Hello, Keyscan, Constraint)
+Refusal = tuple[str, int, int, str]
+"""Robot, epoch and number of a packet, and why it has no effect."""
 
 APPLIED = "applied"
 """A fact: how many packets took effect."""
+WAITING = "waiting"
+"""A fact: how many packets of each robot waited for their effect when ``APPLIED`` was noted."""
 CONFIG = "config"
 """A fact: the mission's configuration."""
 VERSION = 8
@@ -188,11 +192,9 @@ class MissionStore:
             for (data,) in self._database.rows(statement, (after, min(after + _AT_ONCE, until))):
                 yield data
 
-    def packet(self, robot: str, epoch: int, sequence: int) -> StoredPacket:
-        """A stored packet."""
-        statement = f"SELECT {_COLUMNS} FROM packets WHERE robot = ? AND epoch = ? AND sequence = ?"
-        (row,) = self._database.rows(statement, (robot, epoch, sequence))
-        return _packet(*row)
+    def packets(self, numbers: Sequence[tuple[str, int, int]]) -> dict[tuple[str, int, int], StoredPacket]:
+        """Those of some packets that are stored, by robot, epoch and sequence number."""
+        return _found(self._database.rows, numbers)
 
     def envelopes(self, until: int = MOST_PACKETS, after: int = 0) -> list[Envelope]:
         """The envelopes of the packets after arrival ``after`` until arrival ``until``, in that order."""
@@ -205,27 +207,26 @@ class MissionStore:
             for robot, epoch, sequence, time, refused in self._database.rows(statement, (after, until))
         ]
 
-    def refuse(self, robot: str, epoch: int, sequence: int, reason: str) -> None:
-        """Note that a packet does not fit what its robot sent before."""
-        where, number = "robot = ? AND epoch = ? AND sequence = ?", (robot, epoch, sequence)
+    def refuse(self, refusals: Iterable[Refusal]) -> None:
+        """Note packets that do not fit what their robots sent before."""
         with self._database.transaction() as database:
-            change_rows(database, PACKETS, {"refusal": reason}, where, number)
+            _refuse(database, refusals)
 
-    def refusals(self, robot: str) -> list[tuple[int, int, str]]:
-        """Epoch, number and reason of every refused packet of a robot."""
+    def refusals(self, robot: str, limit: int = 100) -> list[tuple[int, int, str]]:
+        """Epoch, number and reason of the last refused packets of a robot, at most ``limit``."""
         columns, where = "epoch, sequence, refusal", "robot = ? AND refusal IS NOT NULL"
+        newest = f"SELECT {columns} FROM packets WHERE {where} ORDER BY epoch DESC, sequence DESC LIMIT ?"
         return [
-            (epoch, sequence, reason)
-            for epoch, sequence, reason in self._database.rows(
-                f"SELECT {columns} FROM packets WHERE {where} ORDER BY epoch, sequence", (robot,)
-            )
+            (epoch, number, reason) for epoch, number, reason in reversed(self._database.rows(newest, (robot, limit)))
         ]
 
-    def refusal_count(self, robot: str) -> int:
-        """How many packets of a robot were refused."""
-        return int(
-            self._database.value("SELECT count(*) FROM packets WHERE robot = ? AND refusal IS NOT NULL", (robot,))
+    def refused(self, robot: str) -> Traffic:
+        """How many packets of a robot were refused, and their bytes."""
+        statement = (
+            "SELECT count(*), coalesce(sum(length(data)), 0) FROM packets WHERE robot = ? AND refusal IS NOT NULL"
         )
+        ((count, size),) = self._database.rows(statement, (robot,))
+        return Traffic(count, int(size))
 
     def newest_hello(self, robot: str, epoch: int) -> Hello | None:
         """The session's newest hello."""
@@ -251,10 +252,20 @@ class MissionStore:
         rows = self._database.rows(f"SELECT data FROM packets WHERE {where}", values)
         return [body for (data,) in rows if isinstance(body := decode(data).body, kind)]
 
-    def progress(self, applied: int, corrections: Sequence[SessionCorrection]) -> None:
-        """Note how many packets took effect; corrections that are news get a new version."""
+    def progress(
+        self,
+        applied: int,
+        corrections: Sequence[SessionCorrection],
+        waiting: Mapping[str, int] | None = None,
+        refusals: Iterable[Refusal] = (),
+    ) -> None:
+        """Note how many packets took effect, how many of which robot wait for that, and which do not fit what their
+        robots sent before; corrections that are news get a new version.
+        """
         with self._database.transaction() as database:
             _remember(database, APPLIED, str(applied))
+            _remember(database, WAITING, " ".join(f"{robot} {count}" for robot, count in (waiting or {}).items()))
+            _refuse(database, refusals)
             for correction in corrections:
                 known = _read_correction(database.execute, correction.robot, correction.epoch)
                 if is_news(None if known is None else known.correction, correction.correction):
@@ -267,7 +278,13 @@ class MissionStore:
 
     def applied(self) -> int:
         """How many packets took effect, before restarts too."""
-        return int(self.fact(APPLIED) or 0)
+        return self.backlog()[0]
+
+    def backlog(self) -> tuple[int, dict[str, int]]:
+        """How many packets took effect, and how many of each robot waited for that at the same time."""
+        return _backlog(
+            dict(self._database.rows("SELECT name, value FROM facts WHERE name IN (?, ?)", (APPLIED, WAITING)))
+        )
 
     def correction(self, robot: str, epoch: int) -> SessionCorrection | None:
         """The newest correction of a session."""
@@ -440,7 +457,7 @@ def check_mission(path: Path) -> None:
             if counts or kind is not None:
                 Label("", PacketKind(kind), None if channel is None else Channel(channel))
         CloudConfig.model_validate_json(facts.get(CONFIG, "{}"))
-        int(facts.get(APPLIED, "0"))
+        _backlog(facts)
     except (ValueError, InputError) as error:
         raise StoreError(f"{path}: {one_line(str(error))}") from error
 
@@ -461,6 +478,16 @@ def _check_edits(rows: Sequence[tuple[int, str, float, str, str]]) -> None:
         edits.append(edit)
 
 
+def _backlog(facts: Mapping[str, str]) -> tuple[int, dict[str, int]]:
+    words = facts.get(WAITING, "").split()
+    return int(facts.get(APPLIED, "0")), dict(zip(words[::2], map(int, words[1::2]), strict=True))
+
+
+def _refuse(database: Transaction, refusals: Iterable[Refusal]) -> None:
+    for *number, reason in refusals:
+        change_rows(database, PACKETS, {"refusal": reason}, "robot = ? AND epoch = ? AND sequence = ?", number)
+
+
 def _remember(database: Transaction, name: str, value: str) -> None:
     database.insert(FACTS, [(name, value)], replaces=True)
 
@@ -471,11 +498,12 @@ def _next(database: Transaction, table: str, column: str) -> int:
 
 def _put(database: Transaction, packets: Sequence[StoredPacket], received_s: float) -> tuple[int, int | None]:
     """How many packets are new, and the index of the first conflicting packet, where it stops."""
-    known, first = _known(database, packets), _next(database, "packets", "arrival")
+    numbers = [(packet.robot, packet.epoch, packet.sequence) for packet in packets]
+    known = {number: bytes(packet.data) for number, packet in _found(database.execute, numbers).items()}
+    first = _next(database, "packets", "arrival")
     conflict: int | None = None
     rows: list[tuple[object, ...]] = []
-    for index, packet in enumerate(packets):
-        number = (packet.robot, packet.epoch, packet.sequence)
+    for index, (number, packet) in enumerate(zip(numbers, packets, strict=True)):
         if number not in known:
             known[number] = packet.data
             times, label = (float(received_s), float(packet.time)), (packet.kind, packet.channel)
@@ -487,21 +515,22 @@ def _put(database: Transaction, packets: Sequence[StoredPacket], received_s: flo
     return len(rows), conflict
 
 
-def _known(database: Transaction, packets: Sequence[StoredPacket]) -> dict[tuple[str, int, int], bytes]:
-    known: dict[tuple[str, int, int], bytes] = {}
-    for begin in range(0, len(packets), _ASKED_AT_ONCE):
-        asked = packets[begin : begin + _ASKED_AT_ONCE]
-        numbers = ", ".join("(?, ?, ?)" for _ in asked)
+def _found(
+    query: Callable[[str, Sequence[object]], Iterable[Any]], numbers: Sequence[tuple[str, int, int]]
+) -> dict[tuple[str, int, int], StoredPacket]:
+    found: dict[tuple[str, int, int], StoredPacket] = {}
+    for begin in range(0, len(numbers), _ASKED_AT_ONCE):
+        asked = numbers[begin : begin + _ASKED_AT_ONCE]
+        marks = ", ".join("(?, ?, ?)" for _ in asked)
         # A join, because SQLite uses no index for "(...) IN (VALUES ...)" and would read all packets.
         statement = (
-            f"WITH asked (robot, epoch, sequence) AS (VALUES {numbers})"
-            " SELECT robot, epoch, sequence, data FROM asked JOIN packets USING (robot, epoch, sequence)"
+            f"WITH asked (robot, epoch, sequence) AS (VALUES {marks})"
+            f" SELECT {_COLUMNS} FROM asked JOIN packets USING (robot, epoch, sequence)"
         )
-        values = [value for packet in asked for value in (packet.robot, packet.epoch, packet.sequence)]
-        for *number, data in database.execute(statement, values).fetchall():
-            robot, epoch, sequence = number
-            known[robot, epoch, sequence] = bytes(data)
-    return known
+        for row in query(statement, [value for number in asked for value in number]):
+            packet = _packet(*row)
+            found[packet.robot, packet.epoch, packet.sequence] = packet
+    return found
 
 
 def _track(stamps: bytes, keyscans: bytes, offsets: bytes) -> Track:

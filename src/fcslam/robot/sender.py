@@ -133,10 +133,10 @@ class Sender:
         for (epoch, sequence), reason in state.refused.items():
             self._set_aside(epoch, sequence, reason)
             self._refused_packets = (
-                f"packets of this robot that the cloud refused: {len(state.refused)}; the last is packet {sequence} of "
+                f"packets of this robot that the cloud refused: {state.refusals}; the last is packet {sequence} of "
                 f"start {epoch}: {reason}"
             )
-        self._known_refusals = len(state.refused)
+        self._known_refusals = state.refusals
 
     def _exchange(self, packets: Sequence[bytes], batch: PacketBatch | None) -> None:
         before = self.confirmed + self.refusals

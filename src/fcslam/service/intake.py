@@ -1,6 +1,8 @@
 """Checks, stores and acknowledges batches of packets; knows no network and does not wait for the fleet."""
 
+import logging
 import threading
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
@@ -13,18 +15,20 @@ from fcslam.errors import FcslamError, InputError, PacketError
 from fcslam.mission.mission_store import MissionStore, StoredPacket
 from fcslam.records import Channel, DetectorFile, Place
 from fcslam.wire.batches import read_batch, write_batch
-from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS
+from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS, MAXIMUM_PACKET_BYTES
 from fcslam.wire.messages import UPLINK, PacketKind
-from fcslam.wire.packets import decode, encode, read_label, read_number
+from fcslam.wire.packets import decode, encode, read_label, read_number, unpacked_size
 
 AGENT_LEASE_S = 30.0
 """How long after its last request an agent keeps its robot to itself."""
-LONGEST_QUEUE = 50_000
-"""Largest number of packets that arrived and did not take effect yet; the service takes no more until some did."""
-MOST_EARLY = 20_000
-"""Largest number of packets of one robot, in all its sessions, that wait for one before them; also how far a packet's
-number may be ahead of the first missing packet of its session.
-"""
+MOST_WAITING = 20_000
+"""Packets of one robot, in all its sessions, that may wait: for their effect, or for a packet before them."""
+MOST_REFUSED_BYTES = 64 * 2**20
+"""Refused packets of one robot that a mission may hold; each counts as ``PACKET_BYTES`` more."""
+PACKET_BYTES = 8 * 2**10
+"""A larger packet counts as several in the rate, by its bytes when it is unpacked."""
+
+_log = logging.getLogger(__name__)
 
 
 class BusyError(FcslamError):
@@ -122,21 +126,27 @@ class Intake:
         announced: Callable[[], Mapping[Channel, DetectorFile]] = dict,
         limits: ClaimLimits | None = None,
         agents: "Agents | None" = None,
-        longest_queue: int = LONGEST_QUEUE,
-        most_early: int = MOST_EARLY,
+        most_waiting: int = MOST_WAITING,
+        most_refused_bytes: int = MOST_REFUSED_BYTES,
     ) -> None:
         """``announced``: detectors that robots are to use; ``limits``: what a robot may send; ``agents``: who speaks
         for the robots, if other instances know that as well.
         """
-        self._longest_queue, self._most_early = longest_queue, most_early
+        self._most_waiting, self._most_refused_bytes = most_waiting, most_refused_bytes
         self._limits = limits = limits or ClaimLimits()
-        burst = max(20.0 * limits.packets_per_s, MAXIMUM_BATCH_PACKETS)  # those of 20 s
+        burst = max(20.0 * limits.packets_per_s, MAXIMUM_BATCH_PACKETS * MAXIMUM_PACKET_BYTES / PACKET_BYTES)
         self._packet_rate = TokenBuckets(clock, limits.packets_per_s, burst)
         self._session_rate = TokenBuckets(clock, limits.sessions_per_hour / 3600.0, limits.sessions_per_hour)
         self._store, self._wall_clock, self._announced = store, wall_clock, announced
         self._agents = agents or Agents(clock)
         self._lock = threading.Lock()
         self._log, self._arrivals = PacketLog(), 0
+        self._released: deque[str] = deque()
+        """Robots of the packets that may take effect and that the worker had not read when it noted its backlog."""
+        self._unread: Counter[str] = Counter()
+        """How many these are, by robot."""
+        self._warned: set[str] = set()
+        """Robots of whose refused packets there was a line."""
         self.follow()
 
     def take(self, robot: str, agent: str, batch: bytes, known_correction: int) -> tuple[bytes, int, bool]:
@@ -159,7 +169,8 @@ class Intake:
         self._agents.hold(robot, agent)
         self.follow()
         encoded = read_batch(batch)
-        self._limit_packets(robot, len(encoded))
+        self._limit_packets(robot, encoded)
+        refused = self._limit_refused(robot, bool(encoded))
         packets, refusal = _checked(robot, encoded)
         numbers = [(packet.robot, packet.epoch, packet.sequence) for packet in packets]
         self._limit_sessions(robot, {epoch for _, epoch, _ in numbers})
@@ -172,7 +183,7 @@ class Intake:
             raise refusal
         epochs = sorted({epoch for _, epoch, _ in numbers}) or [s.epoch for s in self.sessions(robot)[-1:]]
         removed = bool(epochs) and is_removed(session_name(robot, epochs[-1]), in_force(self._store.edits()))
-        return self._replies(robot, epochs, known_correction), self._store.refusal_count(robot), removed
+        return self._replies(robot, epochs, known_correction), refused, removed
 
     def last_heard_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch; None: never since the service started."""
@@ -199,16 +210,30 @@ class Intake:
         with self._lock:
             for envelope in self._store.envelopes(after=self._arrivals):
                 self._arrivals += 1
-                session = session_name(envelope.robot, envelope.epoch)
+                session, before = session_name(envelope.robot, envelope.epoch), self._log.released
                 self._log.add(PacketNumber(session, envelope.sequence), 0.0)
                 for _ in self._log.ready(session):
                     pass
+                self._released.extend([envelope.robot] * (self._log.released - before))
+                self._unread[envelope.robot] += self._log.released - before
 
-    def _limit_packets(self, robot: str, count: int) -> None:
-        wait_s = self._packet_rate.wait_s(robot, count)
+    def _limit_packets(self, robot: str, batch: Sequence[bytes]) -> None:
+        unpacked = sum(map(unpacked_size, batch))  # unpacking takes time
+        wait_s = self._packet_rate.wait_s(robot, max(1.0, len(batch), unpacked / PACKET_BYTES))
         if wait_s > 0.0:
-            limit = f"{self._limits.packets_per_s:g} packets per second (fleet.claims)"
+            limit = f"{self._limits.packets_per_s:g} packets of {PACKET_BYTES} bytes per second (fleet.claims)"
             raise BusyError(f"{robot}: over {limit}; send the others in {wait_s:.0f} s", wait_s)
+
+    def _limit_refused(self, robot: str, sends: bool) -> int:
+        """How many packets of a robot were refused; if they are too many, it sends no more in this mission."""
+        refused = self._store.refused(robot)
+        count, share = refused.count, (refused.bytes + refused.count * PACKET_BYTES) / self._most_refused_bytes
+        if share > 0.5 and robot not in self._warned:
+            self._warned.add(robot)
+            _log.warning("%s: %d packets were refused; at twice as many the mission takes no more of it", robot, count)
+        if share > 1.0 and sends:
+            raise BusyError(f"{robot}: {count} packets were refused, so this mission takes no more of this robot", 60.0)
+        return count
 
     def _limit_sessions(self, robot: str, epochs: Collection[int]) -> None:
         with self._lock:
@@ -220,20 +245,22 @@ class Intake:
             raise BusyError(f"{robot}: over {limit}; the next one can begin in {wait_s:.0f} s", wait_s)
 
     def _make_room(self, robot: str, numbers: Sequence[tuple[str, int, int]]) -> None:
-        """Refuse, for now, what would make the queue or the robot's waiting packets too many."""
-        queue = self.ready_count() - self._store.applied()
-        if queue > self._longest_queue:
-            raise BusyError(f"{queue} packets have not taken effect yet; send these again later")
+        """Refuse, for now, what would make the robot's packets that wait too many."""
+        if not numbers:
+            return
+        applied, queued = self._store.backlog()
         with self._lock:
-            for _, epoch, sequence in numbers:
-                first = self._log.next_sequence(session_name(robot, epoch))
-                if sequence > first + self._most_early:
-                    raise BusyError(f"{robot}: packet {sequence} is far ahead; send packet {first} first")
             early = self._log.would_wait(PacketNumber(session_name(robot, epoch), k) for _, epoch, k in numbers)
-        if early and self.waiting_count(robot) + len(early) > self._most_early:
+            read = applied + sum(queued.values())
+            while self._log.released - len(self._released) < read:
+                self._unread[self._released.popleft()] -= 1
+            waiting = queued.get(robot, 0) + self._unread[robot]
+        if waiting > self._most_waiting:
+            raise BusyError(f"{robot}: {waiting} packets have not taken effect yet; send these again later")
+        if early and self.waiting_count(robot) + len(early) > self._most_waiting:
             session = early[0].session
             raise BusyError(
-                f"{robot}: over {self._most_early} packets wait for one before them; "
+                f"{robot}: over {self._most_waiting} packets wait for one before them; "
                 f"send packet {self._log.next_sequence(session)} of epoch {robot_and_epoch(session)[1]} first"
             )
 

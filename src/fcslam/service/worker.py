@@ -42,7 +42,7 @@ from fcslam.cluster.verifying import verifying
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
-from fcslam.mission.mission_store import CONFIG, Envelope, Finalization, MissionStore, StoredPacket
+from fcslam.mission.mission_store import CONFIG, Envelope, Finalization, MissionStore, Refusal, StoredPacket
 from fcslam.processes import Background, Start, emit_event, start_copy, trim_memory
 from fcslam.runs import QUALITY, Metric, Run
 from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
@@ -59,8 +59,8 @@ from fcslam.wire.packets import decode
 
 AT_ONCE = 64
 AT_ONCE_S = 0.25
-"""Packets, and about the time, between two looks at what else there is to do. Corrections leave in between, so a robot
-does not wait for its own while there is a queue."""
+"""Packets of each robot, and about the time, between two looks at what else there is to do. So no robot's packets, and
+none of its corrections, wait for the queue of another one."""
 REPORT_EVERY_S = 0.1
 """Corrections are not stored more often than this: packets that come in wait until they are on the disk."""
 PAUSE_S = 30.0
@@ -103,8 +103,14 @@ class Worker:
         self._folder, self._store, self._clock, self._emit_event = folder, store, clock, emit_event
         self._start, self._share = start, share
         self._crashes = CrashLog(folder.worker_task)
+        self._queues: dict[str, deque[tuple[int, tuple[str, int, int], StoredPacket | None]]] = {}
+        """By robot, its packets that may take effect: how many could before, its number, and the packet or None."""
         self._ready: deque[StoredPacket] = deque()
-        """Packets that may take effect and did not yet."""
+        """Packets that take effect next; they are in no queue."""
+        self._waiting = 0
+        """How many packets may take effect and did not yet."""
+        self._refusals: list[Refusal] = []
+        """Packets that were refused and are not yet stored as such."""
         self._host = make_host(self._config, self._read, verify_pairs)
         self._arrivals = 0
         """How many packets were read."""
@@ -163,6 +169,8 @@ class Worker:
             self._resumed_at = max(self._resumed_at, applied)
             self._written = 0
             self._ready.clear()
+            self._queues.clear()
+            self._waiting = 0
             self._arrivals, self._read_hash = 0, b""
             self._times.clear()
             self._emit_event(PROGRESS, 0)
@@ -178,15 +186,18 @@ class Worker:
     @property
     def _applied(self) -> int:
         """How many packets took effect or were refused."""
-        return self._host.log.released - len(self._ready)
+        return self._host.log.released - self._waiting
 
     def _take_packets(self) -> bool:
         """Apply packets for about ``AT_ONCE_S``; False if no packet waits."""
         began = self._clock()
         applied, arrivals = self._applied, self._arrivals
+        while self._read_arrivals() and self._clock() <= began + AT_ONCE_S:
+            pass
         if not self._ready:
-            self._read_arrivals()
+            self._begin_round()
         while self._ready:
+            self._waiting -= 1
             self._apply(self._ready.popleft())
             if self._clock() > began + AT_ONCE_S:
                 break
@@ -202,16 +213,19 @@ class Worker:
         if self._reported >= self._applied or now < self._report_at:
             return False
         try:
-            self._store.progress(self._applied, self._corrections())
+            waiting = Counter(packet.robot for packet in self._ready)
+            waiting.update({robot: len(queue) for robot, queue in self._queues.items()})
+            self._store.progress(self._applied, self._corrections(), waiting, self._refusals)
         except StoreError as error:  # a new worker would have to build the fleet in memory again
             _log.error("corrections are stored later: %s", error)
             self._report_at = now + PAUSE_S
             return False
+        self._refusals.clear()
         self._reported, self._report_at = self._applied, now + REPORT_EVERY_S
         return True
 
-    def _read_arrivals(self) -> None:
-        """Read what arrived, and queue the packets that may take effect now."""
+    def _read_arrivals(self) -> bool:
+        """Read some packets that arrived, and queue those that may take effect now; False if there are none."""
         read = self._store.arrivals(self._arrivals, AT_ONCE)
         arrived = {(packet.robot, packet.epoch, packet.sequence): packet for _, packet in read}
         for self._arrivals, packet in read:
@@ -222,8 +236,26 @@ class Worker:
             else:
                 self._host.log.refuse(number)
             for _, sequence in self._host.log.ready(number.session):
-                key = (packet.robot, packet.epoch, sequence)
-                self._ready.append(arrived.get(key) or self._store.packet(*key))
+                key, queue = (packet.robot, packet.epoch, sequence), self._queues.setdefault(packet.robot, deque())
+                kept = arrived.get(key) if len(queue) < AT_ONCE else None
+                queue.append((self._host.log.released, key, kept))
+                self._waiting += 1
+        return bool(read)
+
+    def _begin_round(self) -> None:
+        """Choose what takes effect next: some packets of each robot, in the order in which they could."""
+        queues = list(self._queues.values())
+        chosen = sorted(queue.popleft() for queue in queues for _ in range(min(len(queue), AT_ONCE)))
+        if any(queue and queue[0][0] < chosen[-1][0] for queue in queues):
+            self._host.log.is_canonical = False
+        read = self._store.packets([key for _, key, packet in chosen if packet is None])
+        self._ready.extend(packet or read[key] for _, key, packet in chosen)
+        self._queues = {robot: queue for robot, queue in self._queues.items() if queue}
+
+    def _store_refusals(self) -> None:
+        if self._refusals:
+            self._store.refuse(self._refusals)
+            self._refusals.clear()
 
     def _write_snapshot(self) -> bool:
         """Write the worker's state, if it is new, no packet waits and the last time is long enough ago."""
@@ -233,12 +265,14 @@ class Worker:
         state = {
             "host": self._host.state(),
             "arrivals": self._arrivals,
+            "waiting": [key for _, key, _ in sorted(one for queue in self._queues.values() for one in queue)],
             "edits": self._newest_edit,
             "hash": self._read_hash.hex(),
             "times": [(*session, time_s) for session, time_s in self._times.items()],
             "heard": [(*session, time_s) for session, time_s in self._heard.items()],
         }
         try:
+            self._store_refusals()
             write_state(self._folder.snapshot, self._fits(), state)
             self._share(SNAPSHOT, self._folder.snapshot)
         except (OSError, StoreError) as error:  # a restart takes longer then, and no more
@@ -264,7 +298,9 @@ class Worker:
         except Exception as error:  # a mission must never depend on its snapshot
             _log.warning("%s; the worker applies all packets again", str(error) or type(error).__name__)
             return
-        self._arrivals, self._read_hash = state["arrivals"], read_hash
+        self._arrivals, self._read_hash, self._waiting = state["arrivals"], read_hash, len(state["waiting"])
+        for turn, (robot, epoch, sequence) in enumerate(state["waiting"], self._applied):
+            self._queues.setdefault(robot, deque()).append((turn, (robot, epoch, sequence), None))
         self._times = {(robot, epoch): time_s for robot, epoch, time_s in state["times"]}
         self._heard = {(robot, epoch): time_s for robot, epoch, time_s in state["heard"]}
 
@@ -290,6 +326,7 @@ class Worker:
         except Exception as error:
             # Its state is unknown then: the next worker starts again without it.
             self._refuse(packet, f"the cloud failed on it: {type(error).__name__}: {error}")
+            self._store_refusals()
             raise
         else:
             self._times[packet.robot, packet.epoch] = packet.time
@@ -297,7 +334,7 @@ class Worker:
                 self._heard[packet.robot, packet.epoch] = time.time()
 
     def _refuse(self, packet: StoredPacket, reason: str) -> None:
-        self._store.refuse(packet.robot, packet.epoch, packet.sequence, reason)
+        self._refusals.append((packet.robot, packet.epoch, packet.sequence, reason))
         self._host.log.refuse(_number(packet))
 
     def _corrections(self) -> list[SessionCorrection]:
@@ -330,6 +367,7 @@ class Worker:
             self._store.answer(asked.number, None, f"{MOST_CRASHES} workers in a row ended while they computed it")
             return
         self._crashes.begin(task)
+        self._store_refusals()
         try:
             result = self._result()
             self._run(result, self._store.traffic()).save(self._folder.run(name), force=True)
@@ -349,7 +387,8 @@ class Worker:
         return self._host.conclude((one.time, _number(one)) for one in envelopes if not one.is_refused)
 
     def _read(self, number: PacketNumber) -> Packet:
-        return decode(self._store.packet(*robot_and_epoch(number.session), number.sequence).data)
+        key = (*robot_and_epoch(number.session), number.sequence)
+        return decode(self._store.packets([key])[key].data)
 
     def _write(self, output: "_Output") -> bool:
         """Write an output in a copy of this process, if something is new and the last time is long enough ago."""
@@ -445,6 +484,7 @@ class CrashLog:
             self._suspect, self._crashes = str(before["at"]), int(before["crashes"])
         except (ValueError, LookupError, TypeError):
             self._suspect, self._crashes = "", 0
+        self._begun = ""
 
     def is_fatal(self, task: str) -> bool:
         """Whether the task is left out, after ending too many workers in a row."""
@@ -452,6 +492,9 @@ class CrashLog:
 
     def begin(self, task: str) -> None:
         """Note that the worker begins a task, and has survived the one before."""
+        if self._begun == self._suspect:
+            self._suspect = ""
+        self._begun = task
         state = {"at": task, "crashes": self._crashes + 1 if task == self._suspect else 1}
         with suppress(OSError):  # the disk is full
             os.pwrite(self._file, json.dumps(state).encode().ljust(512), 0)

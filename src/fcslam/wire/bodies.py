@@ -57,6 +57,7 @@ _CONSTRAINT_KINDS = {
 _OF_LASER = "beam_count", "angle_min_rad", "angle_increment_rad", "max_range_m"
 _OF_PLACE = "detector_version", "first", "last"
 _OF_FIX = "latitude_deg", "longitude_deg", "altitude_m", "sigma_m"
+_OF_CORRECTION = "version", "map_index", "quality"
 _OF_FILE = "version", "format", "size", "sha256"
 _CHANNEL_OF_CODE = {int(code): channel for channel, code in _CHANNELS.items()}
 _CONSTRAINT_KIND_OF_CODE = {int(code): kind for kind, code in _CONSTRAINT_KINDS.items()}
@@ -208,17 +209,12 @@ def _check_at_most(count: int, most: int, what: str) -> None:
 
 
 def _write_correction(correction: Correction) -> pb.Correction:
-    return pb.Correction(
-        version=correction.version,
-        map_index=correction.map_index,
-        t_map_odom=_write_pose(correction.T_map_odom),
-        quality=correction.quality,
-    )
+    return pb.Correction(t_map_odom=_write_pose(correction.T_map_odom), **_values(correction, _OF_CORRECTION))
 
 
 def _read_correction(message: pb.Correction, envelope: pb.Packet) -> Correction:
     pose = _read_pose(message, "t_map_odom")
-    return Correction(envelope.robot, message.version, message.map_index, pose, message.quality)
+    return Correction(envelope.robot, T_map_odom=pose, **_values(message, _OF_CORRECTION))
 
 
 def _write_acknowledgement(acknowledgement: Acknowledgement) -> pb.Acknowledgement:

@@ -1,7 +1,6 @@
 """HTTP clients of a robot that follows its fleet (the joint map in tiles, all robots), or reads the maps of a cloud."""
 
 import json
-from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from pydantic import TypeAdapter
@@ -9,24 +8,12 @@ from pydantic import TypeAdapter
 from fcslam.wire.fleet_replies import FleetReply, MapFrontiers, QualityReply, ServedMap
 from fcslam.wire.http_transport import HttpClient
 
-if TYPE_CHECKING:
-    import httpx
-
 _FRONTIERS, _QUALITY = TypeAdapter(tuple[MapFrontiers, ...]), TypeAdapter(tuple[QualityReply, ...])
 _MAPS = TypeAdapter(tuple[ServedMap, ...])
 
 
 class FleetClient(HttpClient):
     """Follows the fleet of one robot. Each method raises as ``HttpTransport.state``."""
-
-    received_bytes = 0
-    """Bytes of the replies' bodies so far."""
-
-    def _ask(self, *request: Any, **options: Any) -> "httpx.Response":
-        response = super()._ask(*request, **options)
-        if response.status_code == 200:
-            self.received_bytes += len(response.content)
-        return response
 
     def exchange(self, robot: str, map_index: int | None, pose: tuple[float, ...] | None) -> FleetReply:
         """Say where the robot is in its map, if it knows, and read where all robots are."""
@@ -70,10 +57,6 @@ class MapClient(HttpClient):
         with self._reading():
             return list(_MAPS.validate_json(response.content))
 
-    def image(self, number: int) -> bytes:
-        """The PGM file of a map."""
-        return self._ask("GET", f"maps/{number}.pgm").content
-
-    def description(self, number: int) -> bytes:
-        """The YAML file of a map."""
-        return self._ask("GET", f"maps/{number}.yaml").content
+    def file(self, number: int, suffix: str) -> bytes:
+        """The file of a map with this suffix."""
+        return self._ask("GET", f"maps/{number}.{suffix}").content

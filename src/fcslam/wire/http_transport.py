@@ -21,6 +21,7 @@ from fcslam.wire.batches import (
     write_batch,
 )
 from fcslam.wire.keys import NO_CREDENTIALS, Credentials, no_passphrase
+from fcslam.wire.limits import MAXIMUM_NETWORK_BYTES
 
 if TYPE_CHECKING:
     import httpx
@@ -73,11 +74,18 @@ class CloudState:
     expected: Mapping[int, int]
     """Next expected sequence number, by epoch."""
     refused: Mapping[tuple[int, int], str] = field(default_factory=dict)
-    """Reason of every refused packet, by epoch and sequence."""
+    """Reason of each of the last refused packets, by epoch and sequence."""
+    refusals: int = 0
+    """Number of refused packets."""
 
 
 class HttpClient:
     """Connection to one cloud; where one of its instances does not answer, the next request asks the next one."""
+
+    received_bytes = 0
+    """Bytes of the replies' bodies so far."""
+    most_reply_bytes = 4 * MAXIMUM_NETWORK_BYTES
+    """A longer reply is not read: a map of 16,000 by 16,000 cells has as many bytes."""
 
     def __init__(self, url: str, shown: Credentials = NO_CREDENTIALS, headers: Mapping[str, str] | None = None) -> None:
         """Open a client of the address ``url``, or of several with commas between them; each request has the headers.
@@ -124,10 +132,23 @@ class HttpClient:
         passes: Collection[int] = (),
     ) -> "httpx.Response":
         """The response, if its status is 200 or one of ``passes``; raises as ``HttpTransport.state``."""
+        import httpx
+
+        with self._trying():
+            with self._explained(), self._client.stream(method, path, content=content, headers=headers) as reply:
+                body, headers = bytearray(), {k: v for k, v in reply.headers.items() if k != "content-encoding"}
+                for part in reply.iter_bytes():
+                    body += part
+                    if len(body) > self.most_reply_bytes:
+                        raise CloudError(f"{self._url}: a reply of over {self.most_reply_bytes} bytes; is it a cloud?")
+            self.received_bytes += len(body)
+            return self._checked(httpx.Response(reply.status_code, headers=headers, content=bytes(body)), passes)
+
+    @contextmanager
+    def _trying(self) -> Iterator[None]:
+        """Where this address cannot be used now, ask the next one from now on."""
         try:
-            with self._explained():
-                response = self._client.request(method, path, content=content, headers=headers)
-            return self._checked(response, passes)
+            yield
         except UnavailableError:
             self.try_next()
             raise
@@ -202,7 +223,7 @@ class HttpTransport(HttpClient):
             state = response.json()
             expected = {int(epoch): int(sequence) for epoch, sequence in state["next"].items()}
             refused = {(int(one["epoch"]), int(one["sequence"])): str(one["reason"]) for one in state["refused"]}
-        return CloudState(expected, refused)
+            return CloudState(expected, refused, int(state.get("refusals", len(refused))))
 
     def send(self, packets: Sequence[bytes], correction: int) -> HttpResponse:
         """Send a batch of encoded packets with the version of the newest correction (-1: none), and wait for the reply.
@@ -217,23 +238,20 @@ class HttpTransport(HttpClient):
             headers={CORRECTION_HEADER: str(correction)},
             passes=(400,),
         )
-        if response.status_code == 400:
-            index = _detail(response).get("index")
-            if isinstance(index, int) and 0 <= index < len(packets):
-                return HttpResponse(refusal=(index, self._reason(response)))
-            reason = self._reason(response)  # the batch was corrupted on its way
-            self.try_next()
-            raise UnavailableError(reason)
-        try:
-            return HttpResponse(
-                tuple(read_batch(response.content)),
-                refused=int(response.headers.get(REFUSED_HEADER, 0)),
-                removed=response.headers.get(REMOVED_HEADER) == "1",
-            )
-        except (PacketError, ValueError) as error:
-            broken = UnavailableError(f"{self._url}: the reply is broken ({error})")
-            self.try_next()
-            raise broken from error
+        index = _detail(response).get("index") if response.status_code == 400 else None
+        if isinstance(index, int) and 0 <= index < len(packets):
+            return HttpResponse(refusal=(index, self._reason(response)))
+        with self._trying():
+            if response.status_code == 400:  # the batch was corrupted on its way
+                raise UnavailableError(self._reason(response))
+            try:
+                return HttpResponse(
+                    tuple(read_batch(response.content)),
+                    refused=int(response.headers.get(REFUSED_HEADER, 0)),
+                    removed=response.headers.get(REMOVED_HEADER) == "1",
+                )
+            except (PacketError, ValueError) as error:
+                raise UnavailableError(f"{self._url}: the reply is broken ({error})") from error
 
     def detector(self, channel: Channel, version: str) -> bytes:
         """Download the file of an announced detector; raises as ``state``."""

@@ -16,7 +16,6 @@ from fcslam.records import Channel
 from fcslam.service.audit_log import audit_file
 from fcslam.service.http.app import create_app
 from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
-from fcslam.service.http.limits import RateLimit
 from fcslam.service.http.state import EventStream, ServiceState
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import Missions
@@ -80,7 +79,6 @@ class Desk:
         self.state = ServiceState(
             missions,
             Authenticator(tokens),
-            RateLimit(lambda: self.now, burst=2.0**21),
             EventStream(beat_s=0.0),
             audit_file(root / "audit.jsonl", lambda: 1e9 + self.now),
         )

@@ -18,8 +18,7 @@ from fcslam.errors import InputError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.maps.palette import ROBOTS
 from fcslam.records import Channel, Correction, Keyscan
-from fcslam.wire import fcslam_pb2 as pb
-from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, VERSION
+from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import decode, encode, readdress
 from tests.scripted import LASER, ScriptedMatcher
@@ -66,14 +65,16 @@ def test_a_robot_hears_what_is_stored_and_where_it_is(mapped):
     assert mapped.told(mapped.send("b", [], **known)) == told[:1]
     state = mapped.ask("GET", f"{API}/robots/b/state", "b").json()
     assert state == {
-        "robot": "b", "epoch": 0, "next": {"0": len(B)}, "correction": told[1].version, "map": 0, "refused": [],
+        "robot": "b", "epoch": 0, "next": {"0": len(B)}, "correction": told[1].version, "map": 0, "refusals": 0,
+        "refused": [],
     }  # fmt: skip
     assert mapped.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": len(A)}
 
 
 def test_a_robot_that_is_not_known_has_nothing_stored(desk):
     state = desk.ask("GET", f"{API}/robots/a/state", "a").json()
-    assert state == {"robot": "a", "epoch": None, "next": {}, "correction": -1, "map": None, "refused": []}
+    empty = {"epoch": None, "next": {}, "correction": -1, "map": None, "refusals": 0, "refused": []}
+    assert state == {"robot": "a", **empty}
     assert desk.told(desk.send("a", [])) == []
 
 
@@ -110,27 +111,13 @@ def test_a_body_that_is_too_long_is_not_read(desk, announced):
 
 
 def test_a_robot_that_sends_too_much_has_to_wait_as_long_as_it_is_told(desk):
-    statuses = [desk.ask("POST", PACKETS, "a", content=b"").status_code for _ in range(200)]
+    statuses = [desk.send("a", A[:1] * MAXIMUM_BATCH_PACKETS).status_code for _ in range(25)]
     limit = statuses.index(429)
     assert set(statuses[:limit]) == {200}
-    response = desk.ask("POST", PACKETS, "a", content=b"")
-    assert desk.ask("POST", f"{API}/robots/b/packets", "b", content=b"").status_code == 200
+    response = desk.send("a", A[:1] * MAXIMUM_BATCH_PACKETS)
+    assert desk.send("b", B[:1]).status_code == 200
     desk.now += int(response.headers["Retry-After"])
-    assert desk.ask("POST", PACKETS, "a", content=b"").status_code == 200
-
-
-def test_what_unpacks_to_much_counts_for_that_before_it_is_unpacked(desk):
-    """Places that announce 2,048 keypoints in a few bytes."""
-
-    def batch(first, count):
-        numbers = range(first, first + count)
-        body = {"number": 0, "channel": 1, "count": 2048, "detector_version": "test-1"}
-        return [pb.Packet(version=VERSION, robot="a", sequence=k, place=body).SerializeToString() for k in numbers]
-
-    assert sum(map(len, batch(0, 100))) < 4000
-    assert desk.send("a", batch(0, 100)).status_code == 413
-    statuses = [desk.send("a", batch(0, 5)).status_code for _ in range(9)]
-    assert (statuses[0], statuses[-1]) == (400, 429)
+    assert desk.send("a", A[:1] * MAXIMUM_BATCH_PACKETS).status_code == 200
 
 
 def test_a_full_disk_is_507_and_nothing_is_acknowledged(desk):

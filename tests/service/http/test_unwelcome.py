@@ -13,8 +13,9 @@ import pytest
 import uvicorn
 
 from fcslam.service.credentials import make_credentials
-from fcslam.service.http import middleware
-from fcslam.service.http.middleware import UnauthenticatedLimit
+from fcslam.service.http import limits
+from fcslam.service.http.authentication import Identity, Role
+from fcslam.service.http.limits import MOST_AT_ONCE, RequestLimits
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
 from tests.service.http.desk import A
 
@@ -47,42 +48,104 @@ def test_requests_without_a_token_are_limited_and_those_with_one_are_not(desk):
         began = time.monotonic()
         assert desk.ask("GET", f"{API}/robots/a/state", "a").status_code == 200
         assert connection.recv(1 << 20).count(b"HTTP/1.1") < many
-        assert time.monotonic() - began < many / middleware.PER_S, "the robot does not wait for them"
+        assert time.monotonic() - began < many / limits.PER_S, "the robot does not wait for them"
+
+
+class Asked:
+    """A request, who sends it from where, and its connection."""
+
+    def __init__(self, gate, who, address=""):
+        self.is_unfinished = self.is_closed = False
+        scope = {"type": "http", "client": (address or who, 1), "who": who, "state": {limits.CONNECTION: self}}
+        self.task = asyncio.ensure_future(gate(scope, None, self.send))
+
+    async def send(self, message):
+        """Nobody reads it."""
+
+    def close(self):
+        self.is_closed, self.is_unfinished = True, False
+
+
+class Gate:
+    """Limits before an application that notes who comes, and answers nobody before ``answer`` has a turn."""
+
+    def __init__(self, **options):
+        self.came, self.answer = [], asyncio.Semaphore(0)
+        names = {"a": Identity("a", Role.ROBOT), "b": Identity("b", Role.ROBOT)}
+        self.limits = RequestLimits(self._app, lambda scope: names.get(scope["who"]), **options)
+
+    async def _app(self, scope, _, send):
+        asked = scope["state"][limits.CONNECTION]
+        self.came.append(scope["client"][0])
+        async with self.answer:
+            await send({"type": "http.response.start", "status": 204})
+        while asked.is_unfinished:
+            await asyncio.sleep(0)
+
+    async def ask(self, *who):
+        asked = [Asked(self.limits, *each) for each in who]
+        await settle()
+        return asked
+
+
+async def settle():
+    for _ in range(9):
+        await asyncio.sleep(0)
 
 
 def test_requests_without_a_token_wait_for_each_other_and_addresses_take_turns():
-    answered = []
+    async def check():
+        gate = Gate()
+        await gate.ask(*[("?", "crowd")] * 60, ("?", "other"), ("a", "robot"))
+        assert gate.came == ["crowd"] * limits.AT_ONCE + ["robot"]
+        while len(gate.came) < limits.AT_ONCE + 4:
+            await asyncio.sleep(0.01)
+        assert "other" in gate.came[limits.AT_ONCE : limits.AT_ONCE + 4]
 
-    async def app(scope, receive, send):
-        answered.append(scope["client"][0])
-
-    async def ask():
-        gate = UnauthenticatedLimit(app, lambda scope: scope["client"][0] == "robot")
-        many = [("crowd", n) for n in range(60)] + [("other", 0), ("robot", 0)]
-        await asyncio.gather(*(gate({"type": "http", "client": who, "state": {}}, None, None) for who in many))
-
-    asyncio.run(ask())
-    assert answered.index("robot") <= middleware.AT_ONCE
-    assert answered.index("other") <= middleware.AT_ONCE + 3
-    assert len(answered) == 62
+    asyncio.run(check())
 
 
-def test_too_many_waiting_requests_without_a_token_are_refused():
-    told = []
+def test_a_token_has_a_few_requests_at_a_time_and_its_addresses_take_turns():
+    async def check():
+        gate = Gate()
+        await gate.ask(*[("a", "thief")] * (3 * MOST_AT_ONCE), ("a", "robot"), ("b", "b"))
+        assert gate.came == ["thief"] * MOST_AT_ONCE + ["b"], "another robot does not wait"
+        for _ in range(2):
+            gate.answer.release()
+            await settle()
+        assert "robot" in gate.came
 
-    async def app(scope, receive, send):
-        pass
+    asyncio.run(check())
 
-    async def send(message):
-        told.append(message.get("status"))
 
-    async def ask():
-        gate = UnauthenticatedLimit(app, lambda _: False, most_waiting=2)
-        crowd = (gate({"type": "http", "client": ("x", 1), "state": {}}, None, send) for _ in range(30))
-        await asyncio.gather(*crowd)
+def test_a_long_answer_takes_no_place_once_it_has_begun():
+    async def check():
+        gate = Gate()
+        asked = await gate.ask(*[("a", "x")] * MOST_AT_ONCE, ("a", "y"))
+        for one in asked:
+            one.is_unfinished = True
+        gate.answer.release()
+        await settle()
+        assert (gate.came[-1], [one.task.done() for one in asked]) == ("y", [False] * len(asked))
+        for one in asked:
+            one.close()
 
-    asyncio.run(ask())
-    assert told.count(429) == 30 - int(middleware.AT_ONCE) - 2
+    asyncio.run(check())
+
+
+def test_of_a_token_the_request_whose_body_does_not_come_makes_room_first():
+    async def check():
+        gate = Gate(patience_s=0.0)
+        asked = await gate.ask(*[("a", "x")] * MOST_AT_ONCE)
+        for one in asked[2:5]:
+            one.is_unfinished = True
+        await gate.ask(("b", "y"))
+        assert not any(one.is_closed for one in asked), "nobody waits"
+        await gate.ask(("a", "z"), ("a", "z"))
+        await asyncio.sleep(0.01)
+        assert [k for k, one in enumerate(asked) if one.is_closed] == [2, 3], "the oldest ones, one for each that waits"
+
+    asyncio.run(check())
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ def fill(store):
     store.configure(CloudConfig(seed=3))
     store.put([packet(sequence=k, data=bytes([k]) * 50) for k in range(30)], 12.25)
     store.put([StoredPacket("b", 1, 4, 0.1 + 0.2, None, None, b"?", "not readable"), packet("b", 1, 0)], 1e9 + 0.1)
-    store.refuse("a", 0, 7, "it does not fit: \N{LATIN SMALL LETTER A WITH DIAERESIS}")
+    store.refuse([("a", 0, 7, "it does not fit: \N{LATIN SMALL LETTER A WITH DIAERESIS}")])
     for x in (0.0, 1.0 / 3.0, 2.0):
         store.progress(5, [correction("a", x), correction("b", -0.0, epoch=1)])
     store.edit(Veto("a", "b", (1.5, 2.5)), "boss", 5.0)
@@ -81,7 +81,7 @@ def test_a_worker_that_lost_its_lease_writes_nothing(registry, postgres, tmp_pat
     assert new.fence == old.fence + 1
     for write in (
         lambda: worker.progress(2, [correction("a", 9.0)]),
-        lambda: worker.refuse("a", 0, 0, "no"),
+        lambda: worker.refuse([("a", 0, 0, "no")]),
         lambda: worker.answer(1, "1"),
         lambda: put_file(postgres, old, "snapshot", tmp_path / "missing"),
     ):
@@ -90,7 +90,7 @@ def test_a_worker_that_lost_its_lease_writes_nothing(registry, postgres, tmp_pat
             write()
     assert worker.applied() == 1
     assert worker.correction("a", 0).correction.T_map_odom[0] == 1.0
-    assert worker.refusal_count("a") == 0
+    assert worker.refused("a").count == 0
     assert fetched(postgres, number, "snapshot") == b"old"
     MissionStore(MissionTables(postgres, number, new)).progress(2, [])
     assert worker.applied() == 2
@@ -163,7 +163,7 @@ def test_names_that_look_like_statements_are_names(registry, postgres, name):
     other.put([packet(), packet("b")], 0.0)
     store = MissionStore(MissionTables(postgres, registry.create(name)))
     store.put([packet(name), packet()], 0.0)
-    store.refuse(name, 0, 0, name)
+    store.refuse([(name, 0, 0, name)])
     store.edit(Removal("a"), name, 1.0)
     store.progress(1, [correction(name, 1.0)])
     store.answer(store.ask_to_finalize(), name, name)
@@ -172,4 +172,4 @@ def test_names_that_look_like_statements_are_names(registry, postgres, name):
     assert [(edit.author, edit.content) for edit in store.edits()] == [(name, Removal("a"))]
     assert store.correction(name, 0) is not None
     assert [(asked.run, asked.failure) for asked in store.finalizations()] == [(name, name)]
-    assert (len(other.arrivals(0, 9)), other.refusal_count(name), other.edits()) == (2, 0, [])
+    assert (len(other.arrivals(0, 9)), other.refused(name).count, other.edits()) == (2, 0, [])

@@ -25,7 +25,6 @@ def learning_router(state: ServiceState, listener: Path) -> APIRouter:
 
     @router.post(f"{PATH}/{{operation:path}}", dependencies=state.require(Role.ROBOT))
     async def learn(request: Request, robot: Name, operation: Operation) -> Response:
-        state.rate.check(robot)
         transport = httpx.AsyncHTTPTransport(uds=str(listener), verify=False)
         address = f"http://learning{PATH.format(robot=robot)}/{operation}"
         try:

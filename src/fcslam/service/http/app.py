@@ -18,8 +18,9 @@ from fcslam.service.http.authentication import Role
 from fcslam.service.http.decisions import decision_router
 from fcslam.service.http.fleet import event_router, fleet_router
 from fcslam.service.http.joint_maps import joint_map_router
+from fcslam.service.http.limits import RequestLimits
 from fcslam.service.http.maps import map_router
-from fcslam.service.http.middleware import UnauthenticatedLimit, local_names, named_missions, watched
+from fcslam.service.http.middleware import local_names, named_missions, watched
 from fcslam.service.http.missions import mission_router
 from fcslam.service.http.problems import add_handlers, problem
 from fcslam.service.http.responses import file_of, refusals
@@ -131,7 +132,7 @@ def create_app(
     if only_local_names:
         app.add_middleware(local_names)
     app.add_middleware(watched, state=state)
-    app.add_middleware(UnauthenticatedLimit, is_known=state.is_known)
+    app.add_middleware(RequestLimits, who=state.who, is_open=lambda: state.authenticator.is_open)
     if named is not None:
         app.add_middleware(named_missions, named=named)
     return app

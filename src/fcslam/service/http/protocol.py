@@ -15,18 +15,16 @@ import uvicorn
 from cryptography import x509
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from fcslam.service.http.middleware import MOST_WAITING, WAITING
+from fcslam.service.http.limits import CONNECTION, WAITING, WHO
 
+MOST_CONNECTIONS = 4096
+"""Connections at a time."""
 WRITE_S = 20.0
 """Time for a client to read what fills the buffers of its connection, 64 KiB and those of the system."""
 REFUSAL_S = 5.0
 """Time until what is no HTTP is answered."""
 IDLE_S = 10.0
 """Time for a TLS handshake, and for the header of a request, from the connection or the response before."""
-BODY_S = 60.0
-"""Time for a request with its body, beside that of its bytes."""
-LEAST_BYTES_PER_S = 20_000
-"""A slower body is cut: a mission that is imported may take long, a client that sends a byte now and then may not."""
 PAUSE_S = 0.001
 """Pause after each connection that is accepted, and after a failure to accept one."""
 _LOOK_EVERY_S = 2.0
@@ -35,18 +33,15 @@ _LOOK_EVERY_S = 2.0
 def allow_many_connections() -> None:
     """Raise this process's limit of open files: connections whose TLS handshake is not done need some, too."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    most = 4 * MOST_WAITING if hard == resource.RLIM_INFINITY else min(4 * MOST_WAITING, hard)
+    most = 4 * MOST_CONNECTIONS if hard == resource.RLIM_INFINITY else min(4 * MOST_CONNECTIONS, hard)
     if soft != resource.RLIM_INFINITY and soft < most:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 @cache
 def most_connections() -> int:
-    """Connections without a request in progress at a time: some files are left for missions and handshakes.
-
-    Of more, one of the address that has most is closed.
-    """
-    return min(MOST_WAITING, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
+    """Connections at a time: some files are left for missions and handshakes."""
+    return min(MOST_CONNECTIONS, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
 
 
 _Factory = Callable[[], asyncio.Protocol]
@@ -130,38 +125,36 @@ class GuardedProtocol(H11Protocol):
     """uvicorn's protocol, with limits for connections that ask nothing, and with the client's certificate.
 
     uvicorn has a timeout only between two requests, and where it limits connections it refuses new ones. So whoever
-    holds idle connections would lock everybody else out.
+    holds connections would lock everybody else out.
     """
 
     _stuck_since: float | None = None
     """When the client stopped to read what is sent; None: it reads."""
-    _idle_since = _asked_since = 0.0
-    """Times of the loop: when the present request began, or when the connection was seen without one first."""
+    _idle_since = 0.0
+    """Time of the loop when the connection was seen without a request first."""
     _look: asyncio.TimerHandle | None = None
-    _seen: object = None
-    """The request at the last look."""
-    _received = 0
-    """Bytes that came in since the present request began."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """After the handshake: a client certificate, if there is one, was signed by the trusted authority."""
         super().connection_made(transport)
-        self._idle_since = self._asked_since = self.loop.time()
+        self._idle_since = self.loop.time()
         self._look = self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
         if len(self.connections) > most_connections():
             self._make_room()
-        self._pass_certificate(transport)
-
-    def data_received(self, data: bytes) -> None:
-        """The client sends."""
-        self._received += len(data)
-        super().data_received(data)
+        self._pass_connection(transport)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """The client or a limit closed the connection."""
         if self._look is not None:
             self._look.cancel()
+        turn = self._state.get(WAITING)
+        if turn is not None and not turn.done():
+            turn.set_result(False)
         super().connection_lost(exc)
+
+    def close(self) -> None:
+        """Close the connection, whatever is on its way."""
+        self.transport.abort()
 
     @property
     def is_idle(self) -> bool:
@@ -169,9 +162,24 @@ class GuardedProtocol(H11Protocol):
         return self.cycle is None or self.cycle.response_complete
 
     @property
+    def is_unfinished(self) -> bool:
+        """Whether a request is in progress whose body has not come."""
+        return not self.is_idle and self.cycle.more_body
+
+    @property
     def may_be_closed(self) -> bool:
-        """Whether the connection is idle, or its request waits among those without a known token."""
-        return self.is_idle or WAITING in self.cycle.scope["state"]
+        """Whether nobody works on a request of the connection."""
+        return self.is_idle or self.cycle.more_body or WAITING in self._state
+
+    @property
+    def holder(self) -> str:
+        """Name of the token of the newest request, or the address."""
+        who = self._state.get(WHO)
+        return who.name if who is not None else self.client[0] if self.client else ""
+
+    @property
+    def _state(self) -> dict[str, Any]:
+        return {} if self.cycle is None else self.cycle.scope["state"]
 
     def pause_writing(self) -> None:
         """The client reads slower than the service sends."""
@@ -193,50 +201,42 @@ class GuardedProtocol(H11Protocol):
             super().send_400_response(msg)
 
     def _enforce_timeouts(self) -> None:
-        """Close the connection if it has been idle, or its request has been coming in, for too long."""
+        """Close the connection if it has been idle, or its client has read nothing, for too long."""
         now = self.loop.time()
-        if self.cycle is not self._seen:
-            self._seen, self._asked_since, self._received = self.cycle, now, 0
-        if self.is_idle:
-            self._asked_since = now
-            is_late = now - self._idle_since > IDLE_S
-        else:
+        if not self.is_idle:
             self._idle_since = now
-            longest_s = BODY_S + self._received / LEAST_BYTES_PER_S
-            is_late = self.cycle.more_body and now - self._asked_since > longest_s
-        if is_late or (self._stuck_since is not None and now - self._stuck_since > WRITE_S):
-            self.transport.abort()
+        if now - self._idle_since > IDLE_S or (self._stuck_since is not None and now - self._stuck_since > WRITE_S):
+            self.close()
         else:
             self._look = self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
 
     def _make_room(self) -> None:
-        """Close the longest idle connection of the address that has most of them; without any, this one."""
-        idle = [each for each in self.connections if isinstance(each, GuardedProtocol) and each.may_be_closed]
-        held = Counter(_address(each) for each in idle if each is not self)
-        if held:
-            ((address, _),) = held.most_common(1)
-            oldest = min((e for e in idle if e is not self and _address(e) == address), key=lambda e: e._idle_since)
-            oldest.transport.abort()
-        else:
-            self.transport.abort()
+        """Close a tenth of the connections of the holder that has most; those whose body has not come, then the oldest.
 
-    def _pass_certificate(self, transport: asyncio.Transport) -> None:
-        """Pass the certificate to the application by ASGI's TLS extension; of its entries only ``client_cert_name``.
+        To find them takes a while, so one is not enough. Without any that may be closed, it is this one.
+        """
+        others = [e for e in self.connections if isinstance(e, GuardedProtocol) and e.may_be_closed and e is not self]
+        ((holder, count),) = Counter(each.holder for each in others).most_common(1) or [("", 0)]
+        held = [each for each in others if each.holder == holder]
+        held.sort(key=lambda each: (not each.is_unfinished, each._idle_since))
+        for each in held[: 1 + count // 10] or [self]:
+            each.close()
 
+    def _pass_connection(self, transport: asyncio.Transport) -> None:
+        """Pass the connection to the limits of requests.
+
+        Pass the certificate to the application by ASGI's TLS extension; of its entries only ``client_cert_name``:
         https://asgi.readthedocs.io/en/latest/specs/tls.html
         """
         tls: ssl.SSLObject | None = transport.get_extra_info("ssl_object")
         shown = None if tls is None else tls.getpeercert(binary_form=True)
-        if shown is None:
-            return
-        name, app = x509.load_der_x509_certificate(shown).subject.rfc4514_string(), self.app
+        name = None if shown is None else x509.load_der_x509_certificate(shown).subject.rfc4514_string()
+        app = self.app
 
-        async def with_certificate(scope: Any, receive: Any, send: Any) -> None:
-            scope["extensions"] = {**scope.get("extensions", {}), "tls": {"client_cert_name": name}}
+        async def with_connection(scope: Any, receive: Any, send: Any) -> None:
+            scope["state"][CONNECTION] = self
+            if name is not None:
+                scope["extensions"] = {**scope.get("extensions", {}), "tls": {"client_cert_name": name}}
             await app(scope, receive, send)
 
-        self.app = with_certificate
-
-
-def _address(protocol: H11Protocol) -> str:
-    return protocol.client[0] if protocol.client else ""
+        self.app = with_connection

@@ -40,7 +40,8 @@ class RobotState(StrictModel):
     next: dict[str, int] = Field(description="by epoch, number of the first packet that is missing")
     correction: int = Field(description="version of the newest correction; -1: none")
     map: int | None = Field(description="number of its map; null: none")
-    refused: list[PacketRefusal]
+    refusals: int = Field(description="number of its packets that were refused")
+    refused: list[PacketRefusal] = Field(description="the last 100 of them")
 
 
 class FleetSummary(StrictModel):
@@ -93,7 +94,7 @@ class RobotSummary(StrictModel):
 
     robot: str
     sessions: list[SessionSummary]
-    refused: list[PacketRefusal]
+    refused: list[PacketRefusal] = Field(description="the last 100")
 
 
 class ClosureSummary(StrictModel):

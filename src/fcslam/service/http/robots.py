@@ -66,12 +66,7 @@ def robot_router(state: ServiceState) -> APIRouter:
         """Store a batch of packets; the response acknowledges what is on disk."""
         body = await read_body(request, MAXIMUM_BATCH_BYTES)
         mission = state.mission
-
-        def take() -> tuple[bytes, int, bool]:
-            state.rate.check(robot, body)
-            return mission.intake.take(robot, agent, body, correction)
-
-        reply, refused, removed = await run_in_threadpool(take)
+        reply, refused, removed = await run_in_threadpool(mission.intake.take, robot, agent, body, correction)
         mission.worker.notify()
         state.measures.answer(robot, reply)
         headers = {REFUSED_HEADER: str(refused), REMOVED_HEADER: str(int(removed))}
@@ -90,6 +85,7 @@ def robot_router(state: ServiceState) -> APIRouter:
             next={str(session.epoch): session.next for session in sessions},
             correction=correction.correction.version if correction else -1,
             map=correction.correction.map_index if correction else None,
+            refusals=store.refused(robot).count,
             refused=refused_packets(store, robot),
         )
 
@@ -126,7 +122,7 @@ def detector_router(state: ServiceState) -> APIRouter:
 
 
 def refused_packets(store: MissionStore, robot: str) -> list[PacketRefusal]:
-    """Refused packets of a robot."""
+    """The last refused packets of a robot."""
     return [
         PacketRefusal(epoch=epoch, sequence=sequence, reason=reason)
         for epoch, sequence, reason in store.refusals(robot)

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Protocol
 from fastapi import Depends, HTTPException, Request, Security
 from fastapi.params import Depends as Dependency
 from fastapi.security import HTTPBearer
-from starlette.requests import HTTPConnection
+from starlette.datastructures import Headers
 from starlette.types import Scope
 
 from fcslam.service.audit_log import AuditLog
 from fcslam.service.detectors import DetectorStore
 from fcslam.service.http.authentication import Authenticator, Identity, Role
-from fcslam.service.http.limits import RateLimit
+from fcslam.service.http.limits import WHO
 from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.missions import Missions, OpenMission
 from fcslam.service.viewed_mission import ViewedMission
@@ -83,7 +83,6 @@ class ServiceState:
 
     missions: "Missions | SharedMissions"
     authenticator: Authenticator
-    rate: RateLimit
     events: EventStream
     audit: AuditLog
     learning: Path | None = None
@@ -125,7 +124,7 @@ class ServiceState:
             if self.authenticator.is_open:
                 self._note(request, ANYBODY, roles)
                 return
-            who = self._who(request)
+            who: Identity | None = request.scope["state"][WHO]
             if who is None:
                 headers = {"WWW-Authenticate": "Bearer"}
                 raise HTTPException(
@@ -146,16 +145,13 @@ class ServiceState:
         """As in ``ViewerState``."""
         if self.closing:
             return False
-        who = None if self.authenticator.is_open else self._who(request)
+        who = self.who(request.scope)
         return self.authenticator.is_open or (who is not None and who.role in roles)
 
-    def is_known(self, scope: Scope) -> bool:
-        """Whether a request has a token or certificate that is known, or needs none."""
-        return self.authenticator.is_open or self._who(HTTPConnection(scope)) is not None
-
-    def _who(self, request: HTTPConnection) -> Identity | None:
-        tls = request.scope.get("extensions", {}).get("tls", {})
-        return self.authenticator.who(request.headers.get("authorization"), tls.get("client_cert_name"))
+    def who(self, scope: Scope) -> Identity | None:
+        """Whose token or certificate a request has; None if nobody's that is known."""
+        tls = scope.get("extensions", {}).get("tls", {})
+        return self.authenticator.who(Headers(scope=scope).get("authorization"), tls.get("client_cert_name"))
 
     @staticmethod
     def _note(request: Request, name: str, roles: Sequence[Role]) -> None:
