@@ -35,7 +35,7 @@ TABLE_ROWS, PAGE_ROWS = 12, 40
 """Most rows of a table on the page of a report, and of all its tables there."""
 
 _COMMAND = "import sys; from fcslam.cli import main; sys.exit(main(sys.argv[1:]))"
-_PACKAGES = ("numpy", "numba", "gtsam", "scipy", "opencv-python-headless", "onnxruntime")
+_PACKAGES = ("numpy", "numba", "scipy", "opencv-python-headless", "onnxruntime")
 
 
 def recordings(*needed: str, kind: str = "lidar") -> Path:

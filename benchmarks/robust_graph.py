@@ -1,7 +1,6 @@
 """Pose graphs in which most closures lie: what is kept, what is rejected, how far the map bends.
 
     FCSLAM_DATA=/path/to/data python benchmarks/robust_graph.py
-    FCSLAM_DATA=/path/to/data python benchmarks/robust_graph.py --gtsam    # and GTSAM's own GNC, minutes more
 
 Several robots: the INTEL graph is cut into 3 robots of equal length, each in an odometry frame of its own; the odometry
 from the end of one to the beginning of the next is left out. False closures between robots are added until they are the
@@ -34,7 +33,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import common
-import gtsam
 import numpy as np
 from evaluation.g2o_files import read_g2o
 from numpy.random import Generator
@@ -42,11 +40,10 @@ from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.graph.evidence import ConsistencySettings
-from fcslam.graph.factors import FactorCache, from_values, to_values
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.joint import JointEvidence, solve_jointly
 from fcslam.graph.optimizer import Solution, optimize, optimize_gnc
-from fcslam.graph.pose_graph import PROBABILITY, Edge, PoseGraph, anchors
+from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.single_robot import solve_single_robot
 from fcslam.records import FloatArray
 
@@ -80,7 +77,6 @@ ALONE = {"seed": "", "solver": "", "s": ".1f", "false rejected": "", "true lost"
 
 def main() -> None:
     parser = common.options(__doc__)
-    parser.add_argument("--gtsam", action="store_true", help="GTSAM's GncLMOptimizer on m3500 beside ours")
     parser.add_argument("--seeds", type=int, default=10, help="draws of each kind")
     parser.add_argument("--graphs", nargs="+", default=INTEL, help="names of files")
     chosen = parser.parse_args()
@@ -252,8 +248,6 @@ def loop_rows(clean: PoseGraph, chosen: argparse.Namespace) -> list[tuple]:
         "GNC from odometry": lambda graph: optimize_gnc(graph, odometry(graph)),
         "least squares": lambda graph: optimize(graph, odometry(graph)),
     }
-    if chosen.gtsam:
-        solvers["GTSAM's GNC from odometry"] = lambda graph: gtsam_gnc(graph, odometry(graph))
     rows = []
     for seed in range(chosen.seeds):
         graph = with_false_loops(clean, np.random.default_rng(seed))
@@ -289,23 +283,6 @@ def with_false_loops(graph: PoseGraph, rng: Generator) -> PoseGraph:
             model = closures[rng.integers(len(closures))]
             false.append(Edge(i, j, model.T_i_j, model.information, robust=True))
     return PoseGraph(graph.poses(), [*graph.edges, *false])
-
-
-def gtsam_gnc(graph: PoseGraph, start: FloatArray) -> Solution:
-    """GTSAM's own graduated non-convexity; odometry and the anchor are known to be true."""
-    robust = graph.arrays().robust
-    problem = FactorCache(graph).squared(np.ones(int(robust.sum())), start)
-    trusted = int((~robust).sum())
-    priors = len(anchors(graph.components()))
-    known = [*range(trusted), *range(problem.size() - priors, problem.size())]
-    parameters = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
-    parameters.setKnownInliers(known)
-    solver = gtsam.GncLMOptimizer(problem, to_values(start), parameters)
-    solver.setInlierCostThresholdsAtProbability(PROBABILITY)
-    poses = from_values(solver.optimize())
-    weights = np.ones(len(robust))
-    weights[robust] = np.asarray(solver.getWeights())[trusted : trusted + int(robust.sum())]
-    return Solution(poses, weights, 0, np.nan)
 
 
 if __name__ == "__main__":

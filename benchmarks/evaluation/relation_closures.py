@@ -67,7 +67,7 @@ class RelationGraph:
     @property
     def component_sizes(self) -> NDArray[np.int64]:
         """Number of stamps in each component, the largest first, shape (C,)."""
-        return np.sort(np.bincount(self.components))[::-1]
+        return np.sort(np.unique(self.components, return_counts=True)[1])[::-1]
 
     def chain_lengths(self, pairs: NDArray[np.int64]) -> FloatArray:
         """Length of the shortest chain of relations between stamps with numbers (K, 2): shape (K,), inf without one."""

@@ -1,9 +1,14 @@
 """Small synthetic graphs with known truth, and an independent solver."""
 
+from collections.abc import Sequence
+from dataclasses import fields
+
+import gtsam
 import numpy as np
-from scipy.optimize import least_squares
 
 from fcslam.geometry import se2
+from fcslam.graph.least_squares import CAUCHY_WIDTH, Loss
+from fcslam.graph.optimizer import PosePrior
 from fcslam.graph.pose_graph import Edge, PoseGraph
 
 COVARIANCE = np.array([[9e-4, 2e-4, 3e-5], [2e-4, 4e-4, -2e-5], [3e-5, -2e-5, 2.5e-5]])
@@ -56,15 +61,32 @@ def manhattan(
     return PoseGraph(np.array(drifted), edges), truth, np.arange(len(edges)) < true_count
 
 
-def least_squares_poses(graph: PoseGraph, poses: np.ndarray) -> np.ndarray:
-    """Least-squares poses with variable 0 held, by SciPy's solver and numerical differentiation."""
-    edges = graph.arrays()
-    roots = np.linalg.cholesky(edges.information).transpose(0, 2, 1)
+def gtsam_problem(
+    graph: PoseGraph, poses: np.ndarray, loss: Loss = Loss.SQUARED, priors: Sequence[PosePrior] = ()
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """GTSAM's factors and values; without priors, the first variable has one at its pose."""
+    edges, problem, values, noise = graph.arrays(), gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel
+    for k, pose in enumerate(poses):
+        values.insert(k, gtsam.Pose2(*pose))
+    for i, j, T_i_j, information, robust in zip(*(getattr(edges, field.name) for field in fields(edges)), strict=True):
+        model = noise.Gaussian.Information(information, False)
+        if robust and loss is Loss.CAUCHY:
+            model = noise.Robust.Create(noise.mEstimator.Cauchy.Create(CAUCHY_WIDTH), model)
+        problem.push_back(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*T_i_j), model))
+    for prior in priors or [PosePrior(0, poses[0], 1e8 * np.eye(3))]:
+        axes = gtsam.Pose2(*prior.pose).matrix() * ((1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+        model = noise.Gaussian.Information(axes.T @ prior.information @ axes, False)
+        problem.push_back(gtsam.PriorFactorPose2(prior.variable, gtsam.Pose2(*prior.pose), model))
+    return problem, values
 
-    def residuals(free: np.ndarray) -> np.ndarray:
-        x = np.vstack((poses[:1], free.reshape(-1, 3)))
-        errors = se2.between(edges.T_i_j, se2.between(x[edges.i], x[edges.j]))
-        return np.einsum("nab,nb->na", roots, errors).ravel()
 
-    found = least_squares(residuals, poses[1:].ravel(), jac="3-point")
-    return np.vstack((poses[:1], found.x.reshape(-1, 3)))
+def gtsam_optimum(
+    graph: PoseGraph, start: np.ndarray, loss: Loss = Loss.SQUARED, priors: Sequence[PosePrior] = ()
+) -> tuple[np.ndarray, float]:
+    """The poses (N, 3) of GTSAM, and their cost."""
+    problem, values = gtsam_problem(graph, start, loss, priors)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(0.0)
+    parameters.setAbsoluteErrorTol(0.0)
+    found = gtsam.LevenbergMarquardtOptimizer(problem, values, parameters).optimize()
+    return gtsam.utilities.extractPose2(found), problem.error(found)

@@ -2,11 +2,13 @@
 
 import json
 
+import gtsam
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from fcslam.geometry import se2
-from fcslam.graph.optimizer import optimize
+from fcslam.graph.optimizer import PosePrior, optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.maps.certificate import (
     AGAIN_M,
@@ -22,6 +24,7 @@ from fcslam.maps.certificate import (
     relative_error,
 )
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
+from tests.graph.graph_worlds import gtsam_problem
 
 COUNT = 40
 BAR_M = 0.25 * SCALE + FLOOR_M
@@ -70,6 +73,17 @@ def test_covariances_are_those_of_sampled_errors():
     measured = np.sqrt((seen**2).mean(axis=0))
     predicted = np.sqrt(relative_error(places.poses, places.covariance, 10.0) ** 2 - FLOOR_M**2) / SCALE
     assert np.allclose(measured, predicted, rtol=0.35)
+
+
+def test_covariances_are_those_of_gtsam():
+    graph, poses = chain(closures=[(0, 20), (10, 30)])
+    places = covariances(graph, [path(poses)])
+    held = PosePrior(0, poses[0], 1e12 * np.eye(3))
+    marginals = gtsam.Marginals(*gtsam_problem(graph, poses, priors=[held]))
+    in_bodies = marginals.jointMarginalCovariance(places.variables.tolist()).fullMatrix()
+    to_map = block_diag(*se2.adjoint(places.poses * (0.0, 0.0, 1.0)))
+    expected = SCALE**2 * to_map @ in_bodies @ to_map.T
+    assert places.covariance == pytest.approx(expected, rel=1e-6, abs=1e-10)
 
 
 @pytest.mark.parametrize("closures", [[(i, i + 5) for i in range(30)], []])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fcslam.anchoring.part import LEAST_SIGMA_M, ROUNDS, MapPart, position_prior
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
-from fcslam.graph.anchored import optimize_anchored
+from fcslam.graph.optimizer import optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray
 

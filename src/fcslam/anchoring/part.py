@@ -8,7 +8,7 @@ import numpy as np
 
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.geometry import se2
-from fcslam.graph.anchored import PosePrior
+from fcslam.graph.optimizer import PosePrior
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray, frozen
 
@@ -37,13 +37,11 @@ def part_of(result: FleetResult, k: int) -> MapPart:
     """Map ``k`` of a result."""
     members = [robot for robot in result.robots if robot.map_index == k]
     rows = _variables(members)
-    edges = result.graph.given()
-    edges = edges.select(np.isin(edges.i, rows) & np.isin(edges.j, rows))
-    edges = replace(edges, i=np.searchsorted(rows, edges.i), j=np.searchsorted(rows, edges.j))
+    every, mine = np.ones(result.graph.edge_count, bool), np.isin(np.arange(len(result.graph)), rows)
     robots = tuple(
         replace(robot, variables=frozen(np.searchsorted(rows, robot.variables), np.int64)) for robot in members
     )
-    return MapPart(robots, PoseGraph.restored(result.graph.poses()[rows], edges))
+    return MapPart(robots, result.graph.restricted(result.graph.poses(), every, mine))
 
 
 def with_part(result: FleetResult, k: int, part: MapPart) -> FleetResult:

@@ -11,7 +11,7 @@ from fcslam.anchoring.part import ROUNDS, MapPart
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.cloud.result import MappedRobot
 from fcslam.geometry import se2
-from fcslam.graph.anchored import PosePrior, optimize_anchored
+from fcslam.graph.optimizer import PosePrior, optimize_anchored
 from fcslam.graph.pose_graph import CHI2_LIMIT, PoseGraph
 from fcslam.lidar import matching
 from fcslam.lidar.field import CELL_M

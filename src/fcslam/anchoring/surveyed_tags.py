@@ -19,9 +19,9 @@ from fcslam.config import StrictModel, one_line, parse_yaml
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
-from fcslam.graph.anchored import optimize_anchored
 from fcslam.graph.cluster import DIRECTION_M
 from fcslam.graph.consistency import TAG_VIEWS
+from fcslam.graph.optimizer import optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray, Tag, TagFamily, TagSighting
 from fcslam.untrusted import MOST_TEXT_BYTES, read_text

@@ -1,13 +1,13 @@
 """The pose graph of the whole fleet: every robot's keyscans, their constraints, the closures between robots."""
 
 from collections.abc import Collection, Container, Iterable, Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
-from fcslam.graph.factors import FactorCache, Loss
+from fcslam.graph.least_squares import Loss
 from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, EdgeArrays, PoseGraph, Rows
 from fcslam.graph.trajectory import Trajectory, build_trajectory
@@ -27,7 +27,6 @@ class JointGraph:
 
     def __init__(self) -> None:
         self.graph = PoseGraph()
-        self._factors = FactorCache(self.graph)
         self._variables: dict[str, Rows[np.int64]] = {}
         self._chains: dict[str, Rows[np.float64]] = {}
         self._step_covariance: dict[str, Rows[np.float64]] = {}
@@ -126,11 +125,11 @@ class JointGraph:
 
     def optimize(self) -> None:
         """Quick solve (Levenberg-Marquardt with a Cauchy loss on closures) of the maps whose closures changed."""
-        start, kept, edges, changed = self._poses.values, self._kept(), self.graph.arrays(), list(self._changed)
+        poses, kept, edges, changed = self._poses.values.copy(), self._kept(), self.graph.arrays(), list(self._changed)
         component = self.graph.components(kept)
         solved = np.isin(component, component[np.concatenate((edges.i[changed], edges.j[changed]))])
-        solution = optimize(self.graph, start, loss=Loss.CAUCHY, kept=kept, factors=self._factors, solved=solved)
-        self.take(solution.poses)
+        poses[solved] = optimize(self.graph.restricted(poses, kept, solved), loss=Loss.CAUCHY).poses
+        self.take(poses)
 
     def take(self, poses: FloatArray) -> None:
         """Replace the estimate by a solution, shape (N, 3)."""
@@ -147,10 +146,8 @@ class JointGraph:
         for robot, T_robot in T_map_base.items():
             variables = self._variables[robot].values
             poses[variables], kept[variables] = T_robot, True
-        edges, numbers = self.graph.given(), np.cumsum(kept) - 1
-        counts = np.array([number not in left_out for number in range(len(edges.i))], bool)
-        edges = edges.select(counts & kept[edges.i] & kept[edges.j])
-        return PoseGraph.restored(poses[kept], replace(edges, i=numbers[edges.i], j=numbers[edges.j]))
+        counts = np.array([number not in left_out for number in range(self.graph.edge_count)], bool)
+        return self.graph.restricted(poses, counts, kept)
 
     def held_variables(self, robots: Collection[str]) -> dict[str, NDArray[np.int64]]:
         """Variables of each of these robots in the graph that ``held`` makes of them, in the order of its path."""
@@ -186,7 +183,6 @@ class JointGraph:
     def restore(self, state: State) -> None:
         """Take over a ``state``."""
         self.graph = PoseGraph.restored(state["initial"], EdgeArrays(**state["edges"]))
-        self._factors = FactorCache(self.graph)
         self._poses = Rows(state["poses"])
         self._left_out, self._unsolved = set(state["left_out"]), state["unsolved"]
         self._changed = set(state["changed"])

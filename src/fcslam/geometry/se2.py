@@ -93,6 +93,20 @@ def log(T_a_b: ArrayLike) -> Array:
     return np.stack((vx, vy, omega), axis=-1)
 
 
+def log_jacobian(tangent: ArrayLike) -> Array:
+    """Matrix J with ``log(exp(v) exp(d)) = v + J d`` to first order in d, shape (..., 3, 3); v of shape (..., 3)."""
+    v = np.asarray(tangent, dtype=np.float64)
+    half = v[..., 2] / 2.0
+    small = np.abs(half) < 1e-3
+    safe = np.where(small, 1.0, half)
+    a = np.where(small, 1.0 - half * half / 3.0, safe / np.tan(safe))
+    b = np.where(small, half / 6.0, (1.0 - a) / (2.0 * safe))
+    x, y = b * v[..., 0] + v[..., 1] / 2.0, b * v[..., 1] - v[..., 0] / 2.0
+    zero = np.zeros_like(half)
+    rows = ((a, -half, x), (half, a, y), (zero, zero, zero + 1.0))
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
 def adjoint(T_a_b: ArrayLike) -> Array:
     """Matrix Ad with ``T exp(v) T^-1 = exp(Ad v)``, shape (..., 3, 3)."""
     pose = np.asarray(T_a_b, dtype=np.float64)

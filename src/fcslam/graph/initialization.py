@@ -1,15 +1,15 @@
 """Initial poses of a graph without a good estimate, by chordal relaxation: two sparse linear systems.
 
 Rotations as complex numbers of any length minimise ``sum k |u_j - u_i e^(i theta_ij)|^2``; translations follow with
-the rotations held (Carlone et al., ICRA 2015, in the plane). GTSAM's LAGO solves the same problem, but takes only
-diagonal information and one component at a time.
+the rotations held (Carlone et al., ICRA 2015, in the plane).
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fcslam.geometry import se2
-from fcslam.graph.pose_graph import PoseGraph, anchors
+from fcslam.graph.cholesky import Structure, find_structure, solve
+from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray
 
 _INFORMATION_RATIO = 1e4
@@ -38,18 +38,18 @@ def initialize(graph: PoseGraph, weights: ArrayLike | None = None) -> FloatArray
     if not kept.any():
         return start
     i, j, T_i_j, scale = edges.i[kept], edges.j[kept], edges.T_i_j[kept], scale[kept]
-    fixed = anchors(graph.components(kept))
+    structure, held = find_structure(i, j, len(graph)), graph.components(kept) == np.arange(len(graph))
     information = edges.information[kept]
     k_heading = np.sqrt(scale * _clip_to_median(information[:, 2, 2]))
     k_position = np.sqrt(scale * _clip_to_median(0.5 * (information[:, 0, 0] + information[:, 1, 1])))
 
     turn = np.exp(1j * T_i_j[:, 2])
-    heading = np.angle(_least_squares((i, j), k_heading, turn, 0.0 * turn, (fixed, np.exp(1j * start[fixed, 2]))))
+    heading = np.angle(_least_squares(structure, k_heading, turn, 0.0 * turn, held, held * np.exp(1j * start[:, 2])))
     step = np.exp(1j * heading[i]) * (T_i_j[:, 0] + 1j * T_i_j[:, 1])
-    origin = start[fixed, 0] + 1j * start[fixed, 1]
-    position = _least_squares((i, j), k_position, np.ones_like(turn), step, (fixed, origin))
+    origin = held * (start[:, 0] + 1j * start[:, 1])
+    position = _least_squares(structure, k_position, np.ones_like(turn), step, held, origin)
     poses = np.stack((position.real, position.imag, se2.wrap_angle(heading)), axis=-1)
-    poses[fixed] = start[fixed]
+    poses[held] = start[held]
     return poses
 
 
@@ -79,28 +79,14 @@ def _clip_to_median(information: FloatArray) -> FloatArray:
 
 
 def _least_squares(
-    ends: tuple[NDArray[np.int64], NDArray[np.int64]],
-    k: FloatArray,
-    turn: _Complex,
-    step: _Complex,
-    fixed: tuple[NDArray[np.int64], _Complex],
+    structure: Structure, k: FloatArray, turn: _Complex, step: _Complex, held: NDArray[np.bool_], z: _Complex
 ) -> _Complex:
-    """The z with least ``sum |k (z_j - turn z_i - step)|^2``, each component's gauge set by its ``fixed`` value."""
-    from scipy.sparse import csr_array  # a live robot has no use for it, and it is large
-    from scipy.sparse.linalg import splu
-
-    (i, j), (anchor, value) = ends, fixed
-    edge_row = np.arange(len(i))
-    anchor_row = len(i) + np.arange(len(anchor))
-    rows = np.concatenate((edge_row, edge_row, anchor_row))
-    columns = np.concatenate((j, i, anchor))
-    entries = np.concatenate((k.astype(complex), -k * turn, np.full(len(anchor), k.max(), dtype=complex)))
-    size = int(columns.max()) + 1
-    A = csr_array((entries, (rows, columns)), shape=(len(i) + len(anchor), size))
-    b = np.concatenate((k * step, k.max() * value))
-    adjoint = A.conj().T
-    solver = splu(
-        (adjoint @ A).tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
-    solution: _Complex = solver.solve(adjoint @ b)
+    """The z (N,) with least ``sum |k (z_j - turn z_i - step)|^2``, from a z whose ``held`` numbers stay."""
+    i, j, *_ = structure
+    of_j = k[:, None, None] * np.eye(2)
+    rotation = np.stack((turn.real, -turn.imag, turn.imag, turn.real), axis=-1).reshape(-1, 2, 2)
+    residual = (k * (z[j] - turn * z[i] - step)).view(float).reshape(-1, 2)
+    unit = np.tile(np.eye(2), (len(k), 1, 1))
+    change, _ = solve(structure, (-of_j @ rotation, of_j), unit, residual, held)
+    solution: _Complex = z + change.view(complex)[:, 0]
     return solution

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from fcslam.geometry import se2
 from fcslam.graph.bridges import contradicted_bridges
-from fcslam.graph.chains import find_chains
 from fcslam.graph.cluster import (
     ClusterDecision,
     closure_positions,
@@ -24,7 +23,6 @@ from fcslam.graph.cluster import (
 )
 from fcslam.graph.consistency import Closures, count_supporting_closures
 from fcslam.graph.evidence import ConsistencySettings, MapFit, shortfall
-from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize
 from fcslam.graph.optimizer import INLIER_WEIGHT, Solution, optimize_gnc, refine_inliers
 from fcslam.graph.pose_graph import PoseGraph
@@ -131,9 +129,8 @@ def solve_jointly(
         Poses (N, 3), weights (E,), and the maps.
     """
     # 1. Optimize each robot's own graph.
-    factors = FactorCache(evidence.graph, find_chains(evidence.graph))
     initial = evidence.graph.poses()
-    own = [_solve_own_graph(evidence, robot, initial[robot], factors) for robot in evidence.robots]
+    own = [_solve_own_graph(evidence, robot, initial[robot]) for robot in evidence.robots]
     paths = [path for path, _ in own]
     # 2. Find the dominant cluster of closures between every two robots (PCM).
     links = _find_links(evidence, paths, consistency, examine)
@@ -148,13 +145,13 @@ def solve_jointly(
         within_maps = _edges_within_maps(evidence, maps)
         # 4. Solve with the supported closures, then decide all closures within maps by that solution.
         supported = within_maps & _supported_edges(evidence, [inliers for _, inliers in own], joining)
-        solution = _solve_supported(evidence, supported, paths, frames, bool(known or joining), factors)
-        solution = _refine_inliers(factors, within_maps, solution)
+        solution = _solve_supported(evidence, supported, paths, frames, bool(known or joining))
+        solution = _refine_inliers(evidence.graph, within_maps, solution)
         # 5. Withdraw isolated closures and decide once more.
         isolated = _isolated_closures(evidence, paths, solution, consistency.separation_m)
         if isolated.any():
             trusted = replace(solution, weights=solution.weights * ~isolated)
-            solution = _refine_inliers(factors, within_maps, trusted)
+            solution = _refine_inliers(evidence.graph, within_maps, trusted)
         # 6. Repeat without the links that the joint solution contradicts.
         confirmed = [link for link in joining if is_confirmed(link, paths, solution, evidence.informative, consistency)]
         # 7. Robots that alone join maps that contradict each other leave them.
@@ -174,7 +171,6 @@ def _solve_own_graph(
     evidence: JointEvidence,
     robot: NDArray[np.int64],
     initial: FloatArray,
-    factors: FactorCache,
 ) -> tuple[Trajectory, NDArray[np.int64]]:
     graph = evidence.graph
     number = np.full(len(graph), -1)
@@ -183,9 +179,7 @@ def _solve_own_graph(
     mine = np.flatnonzero((number[edges.i] >= 0) & (number[edges.j] >= 0) & ~evidence.excluded)
     own = graph.given().select(mine)
     own_graph = PoseGraph.restored(initial, replace(own, i=number[own.i], j=number[own.j]))
-    same = np.array_equal(robot, np.arange(len(graph)))  # then its factors are those of the joint graph
-    own_factors = factors.restricted(own_graph, ~evidence.excluded[edges.robust]) if same else None
-    solution = solve_single_robot(own_graph, own_factors)
+    solution = solve_single_robot(own_graph)
     return robot_trajectory(own_graph, solution.poses), mine[solution.weights > INLIER_WEIGHT]
 
 
@@ -279,7 +273,6 @@ def _solve_supported(
     own: Sequence[Trajectory],
     frames: Sequence[FloatArray],
     joined: bool,
-    factors: FactorCache,
 ) -> Solution:
     """Graduated non-convexity with supported closures only, so that false ones cannot distort its start.
 
@@ -292,19 +285,16 @@ def _solve_supported(
     for robot, path, frame in zip(evidence.robots, own, frames, strict=True):
         start[robot] = se2.compose(frame, path.poses)
     subgraph = graph.restricted(start, supported)
-    kept = factors.restricted(subgraph, supported[graph.arrays().robust])
     starts = (start, initialize(subgraph)) if joined else (start,)
-    solutions = [optimize_gnc(subgraph, poses, factors=kept) for poses in starts]
+    solutions = [optimize_gnc(subgraph, poses) for poses in starts]
     best = min(solutions, key=lambda solution: solution.cost)
     return _expand_weights(best, supported)
 
 
-def _refine_inliers(factors: FactorCache, within_maps: NDArray[np.bool_], trusted: Solution) -> Solution:
+def _refine_inliers(graph: PoseGraph, within_maps: NDArray[np.bool_], trusted: Solution) -> Solution:
     """Decide every edge within a map, starting from the inliers of a trusted solution."""
-    graph = factors.graph
     subgraph = graph.restricted(trusted.poses, within_maps)
-    kept = factors.restricted(subgraph, within_maps[graph.arrays().robust])
-    refined = refine_inliers(subgraph, None, trusted.weights[within_maps], factors=kept)
+    refined = refine_inliers(subgraph, None, trusted.weights[within_maps])
     return _expand_weights(refined, within_maps)
 
 

@@ -1,22 +1,19 @@
-"""Optimal poses of a pose graph: Levenberg-Marquardt (GTSAM), and graduated non-convexity against false closures.
+"""Optimal poses of a pose graph: Levenberg-Marquardt, and graduated non-convexity against false closures.
 
 Gauge: each connected component keeps the initial pose of its first variable.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fcslam.geometry import se2
-from fcslam.graph.factors import FactorCache, Loss
-from fcslam.graph.pose_graph import CHI2_LIMIT, PoseGraph, anchors
+from fcslam.graph.least_squares import Loss, minimize
+from fcslam.graph.pose_graph import CHI2_LIMIT, SE2, EdgeArrays, PoseGraph
 from fcslam.records import FloatArray, frozen
 
-_TOLERANCE = 1e-6
-"""Relative and absolute change of the cost at which Levenberg-Marquardt ends."""
 _MAXIMUM_ITERATIONS = 100
 """Limit of Levenberg-Marquardt's iterations; it converges long before."""
 _BINARY = 1e-4
@@ -50,9 +47,6 @@ def optimize(
     initial: ArrayLike | None = None,
     *,
     loss: Loss = Loss.SQUARED,
-    kept: ArrayLike | None = None,
-    factors: FactorCache | None = None,
-    solved: NDArray[np.bool_] | None = None,
 ) -> Solution:
     """Optimize a pose graph by Levenberg-Marquardt.
 
@@ -60,62 +54,38 @@ def optimize(
         graph: N variables and E edges.
         initial: poses to start from, shape (N, 3), metres and radians; None: the graph's own.
         loss: loss of the closures.
-        kept: closures that count, shape (E,); None: all.
-        factors: a cache that makes repeated solves of a growing graph cheaper.
-        solved: variables of the connected components to solve, shape (N,); others stay, and do not count in the cost.
-            None: all.
 
     Returns:
         Poses (N, 3) and weights (E,).
     """
-    start, cache = _start(graph, initial), _cache(graph, factors)
-    if not graph.edge_count:
-        return _solution(graph, start, start, np.ones(0), 0, 0.0)
-    robust = graph.arrays().robust
-    counts = np.ones(int(robust.sum()), dtype=bool) if kept is None else np.asarray(kept, dtype=bool)[robust]
-    problem, values = cache.robust(loss, counts, start, solved), cache.values(start, solved)
-    result, iterations = _levenberg_marquardt(problem, values, _MAXIMUM_ITERATIONS)
-    poses = start.copy()
-    cache.read(result, poses, solved)
-    cache.complete(poses)
-    weights = counts * loss.weights(graph.chi2(poses)[robust])
-    return _solution(graph, start, poses, weights, iterations, problem.error(result))
+    steps = _Steps(graph, initial)
+    chi2 = steps.solve(np.ones_like(steps.chi2()), _MAXIMUM_ITERATIONS, loss)
+    return steps.solution(loss.weights(chi2), steps.cost)
 
 
 def optimize_gnc(
     graph: PoseGraph,
     initial: ArrayLike | None = None,
-    *,
-    factors: FactorCache | None = None,
 ) -> Solution:
     """Optimize under the truncated squared loss on closures: each ends at weight 1 (inlier) or 0 (outlier).
 
     Graduated non-convexity (Yang et al., RA-L 2020, truncated least squares, eqs. 12-14); odometry always counts.
 
-    The steps run here, around GTSAM's solver, and not in ``gtsam.GncLMOptimizer``, which starts every step again from
-    the initial poses and solves it to convergence. One warm iteration per step decides as well in a tenth of the time
-    (``benchmarks/results/graph.md``, m3500 with 100 random false loops). Neither is sure to find the best set: the
-    drift of the odometry may favour a false loop.
+    Each step is one iteration from the poses of the step before. To solve every step to convergence decides as well in
+    ten times the time (``benchmarks/robust_graph.py``, m3500 with 100 random false loops). Neither is sure to find the
+    best set: the drift of the odometry may favour a false loop.
 
     ``initial`` is odometry or better. Arguments and result as of ``optimize``.
     """
-    start, cache = _start(graph, initial), _cache(graph, factors)
-    robust = graph.arrays().robust
-    if not graph.edge_count:
-        return _solution(graph, start, start, np.ones(0), 0, 0.0)
-    steps = _Steps(cache, start)
-    steps.solve(np.ones(int(robust.sum())), _FIRST_ITERATIONS)
-    _graduate(steps)
-    weights = _alternate(steps, (steps.chi2() <= CHI2_LIMIT).astype(np.float64))
-    return _with_truncated_cost(graph, start, steps, weights)
+    steps = _Steps(graph, initial)
+    _graduate(steps, steps.solve(np.ones_like(steps.chi2()), _FIRST_ITERATIONS))
+    return _alternate(steps, (steps.chi2() <= CHI2_LIMIT).astype(np.float64))
 
 
 def refine_inliers(
     graph: PoseGraph,
     initial: ArrayLike | None,
     weights: ArrayLike,
-    *,
-    factors: FactorCache | None = None,
 ) -> Solution:
     """Alternate solving and deciding every closure by its residual, until no decision changes.
 
@@ -124,42 +94,64 @@ def refine_inliers(
 
     ``weights`` (E,): edges above one half are trusted at the start. Other arguments and result as of ``optimize``.
     """
-    start, cache = _start(graph, initial), _cache(graph, factors)
     trusted = np.asarray(weights, dtype=np.float64)
     if trusted.shape != (graph.edge_count,):
         raise ValueError(f"weights must be of shape ({graph.edge_count},), not {trusted.shape}")
-    if not graph.edge_count:
-        return _solution(graph, start, start, np.ones(0), 0, 0.0)
-    robust = graph.arrays().robust
-    steps = _Steps(cache, start)
-    decided = _alternate(steps, (trusted[robust] > INLIER_WEIGHT).astype(np.float64))
-    return _with_truncated_cost(graph, start, steps, decided)
+    return _alternate(_Steps(graph, initial), (trusted[graph.arrays().robust] > INLIER_WEIGHT).astype(np.float64))
 
 
 class _Steps:
-    def __init__(self, cache: FactorCache, poses: FloatArray) -> None:
-        self.cache, self.poses, self.iterations = cache, poses.copy(), 0
-        self._values = cache.values(poses)
-        self._robust = np.flatnonzero(cache.graph.arrays().robust)
+    """Solves of one graph, each from the poses of the one before."""
+
+    def __init__(self, graph: PoseGraph, initial: ArrayLike | None) -> None:
+        self.poses = graph.poses() if initial is None else np.array(initial, dtype=np.float64)
+        if self.poses.shape != (len(graph), 3) or not np.isfinite(self.poses).all():
+            shape = self.poses.shape
+            raise ValueError(f"initial poses must be finite and of shape ({len(graph)}, 3), not {shape}")
+        self.cost = 0.0
+        self._graph, self._start, self._iterations = graph, self.poses, 0
+        self._robust = np.flatnonzero(graph.arrays().robust)
         self._optimal_for: FloatArray | None = None
         """The weights for which the poses are optimal."""
 
-    def solve(self, weights: FloatArray, iterations: int) -> None:
-        if self._optimal_for is not None and np.array_equal(weights, self._optimal_for):
-            return
-        problem = self.cache.squared(weights, self.poses)
-        self._values, used = _levenberg_marquardt(problem, self._values, iterations)
-        self.cache.read(self._values, self.poses)
-        self.iterations += used
-        self._optimal_for = weights if used < iterations else None
+    def solve(self, weights: FloatArray, iterations: int, loss: Loss = Loss.SQUARED) -> FloatArray:
+        """Optimize with closures of these weights, shape (K,), and return ``chi2``; those of weight 0 are left out."""
+        if self._optimal_for is None or not np.array_equal(weights, self._optimal_for):
+            scale = self._scale(weights)
+            edges = self._graph.arrays().select(scale > 0.0)
+            edges = replace(edges, information=edges.information * scale[scale > 0.0, None, None])
+            held = self._graph.components(scale > 0.0) == np.arange(len(self.poses))
+            self.poses, used, self.cost = minimize(SE2, edges, self.poses, held, loss=loss, iterations=iterations)
+            self._iterations += used
+            self._optimal_for = weights if used < iterations else None
+        return self.chi2()
 
     def chi2(self) -> FloatArray:
         """Squared Mahalanobis lengths of the closures' residuals, shape (K,)."""
-        return self.cache.graph.chi2(self.poses, self._robust)
+        return self._graph.chi2(self.poses, self._robust)
+
+    def solution(self, weights: FloatArray, cost: float) -> Solution:
+        """The poses, each connected component moved so that its first variable is where it started."""
+        scale, start, poses = self._scale(weights), self._start, self.poses
+        first = self._graph.components(scale > 0.0)
+        moved = se2.compose(se2.compose(start[first], se2.inverse(poses[first])), poses)
+        moved[first] = start[first]
+        return Solution(frozen(moved), frozen(scale), self._iterations, cost)
+
+    def truncated_cost(self) -> float:
+        """Cost with the truncated squared loss on closures."""
+        chi2 = self._graph.chi2(self.poses)
+        chi2[self._robust] = np.minimum(chi2[self._robust], CHI2_LIMIT)
+        return 0.5 * float(chi2.sum())
+
+    def _scale(self, weights: FloatArray) -> FloatArray:
+        """Weights of all edges, shape (E,), from those of the closures, shape (K,)."""
+        scale = np.ones(self._graph.edge_count)
+        scale[self._robust] = weights
+        return scale
 
 
-def _graduate(steps: _Steps) -> None:
-    chi2 = steps.chi2()
+def _graduate(steps: _Steps, chi2: FloatArray) -> None:
     largest = chi2.max(initial=0.0)
     if largest <= CHI2_LIMIT:
         return
@@ -168,28 +160,19 @@ def _graduate(steps: _Steps) -> None:
         weights = _truncated_weights(chi2, mu)
         if np.all((weights < _BINARY) | (weights > 1.0 - _BINARY)):
             return
-        steps.solve(weights, iterations=1)
-        chi2 = steps.chi2()
+        chi2 = steps.solve(weights, iterations=1)
         mu *= _CONTROL_STEP
 
 
-def _alternate(steps: _Steps, weights: FloatArray) -> FloatArray:
+def _alternate(steps: _Steps, weights: FloatArray) -> Solution:
     """Alternate solve and decision until no decision changes, each of which lowers the truncated loss."""
     for _ in range(_REFINEMENT_ROUNDS):
-        steps.solve(weights, _MAXIMUM_ITERATIONS)
-        decided = (steps.chi2() <= CHI2_LIMIT).astype(np.float64)
+        decided = (steps.solve(weights, _MAXIMUM_ITERATIONS) <= CHI2_LIMIT).astype(np.float64)
         if np.array_equal(decided, weights):
-            return weights
+            break
         weights = decided
     steps.solve(weights, _MAXIMUM_ITERATIONS)
-    return weights
-
-
-def _with_truncated_cost(graph: PoseGraph, start: FloatArray, steps: _Steps, weights: FloatArray) -> Solution:
-    poses, robust = steps.poses, graph.arrays().robust
-    steps.cache.complete(poses)
-    cost = _truncated(graph.chi2(poses), robust)
-    return _solution(graph, start, poses, weights, steps.iterations, cost)
+    return steps.solution(weights, steps.truncated_cost())
 
 
 def _truncated_weights(chi2: FloatArray, mu: float) -> FloatArray:
@@ -199,41 +182,40 @@ def _truncated_weights(chi2: FloatArray, mu: float) -> FloatArray:
     return np.clip(between, 0.0, 1.0)
 
 
-def _truncated(chi2: FloatArray, robust: ArrayLike) -> float:
-    return 0.5 * float(np.where(robust, np.minimum(chi2, CHI2_LIMIT), chi2).sum())
+@dataclass(frozen=True, slots=True, eq=False)
+class PosePrior:
+    """A measured pose of one variable."""
+
+    variable: int
+    pose: FloatArray
+    """Shape (3,), metres and radians."""
+    information: FloatArray
+    """Inverse covariance in the coordinates of the frame outside (x, y) and of the heading, shape (3, 3)."""
+
+    def chi2(self, poses: FloatArray) -> float:
+        """Squared Mahalanobis distance of the poses (N, 3)."""
+        residual = poses[self.variable] - self.pose
+        residual[2] = se2.wrap_angle(residual[2])
+        return float(residual @ self.information @ residual)
 
 
-def _levenberg_marquardt(problem: Any, values: Any, iterations: int) -> tuple[Any, int]:
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(iterations)
-    parameters.setRelativeErrorTol(_TOLERANCE)
-    parameters.setAbsoluteErrorTol(_TOLERANCE)
-    solver = gtsam.LevenbergMarquardtOptimizer(problem, values, parameters)
-    result = solver.optimize()
-    return result, int(solver.iterations())
+def optimize_anchored(graph: PoseGraph, initial: FloatArray, priors: Sequence[PosePrior]) -> FloatArray:
+    """Optimize a pose graph, all of whose edges count, with priors; returns poses (N, 3) in the frame of the priors.
 
-
-def _start(graph: PoseGraph, initial: ArrayLike | None) -> FloatArray:
-    poses = graph.poses() if initial is None else np.array(initial, dtype=np.float64)
-    if poses.shape != (len(graph), 3) or not np.isfinite(poses).all():
-        raise ValueError(f"initial poses must be finite and of shape ({len(graph)}, 3), not {poses.shape}")
-    return poses
-
-
-def _cache(graph: PoseGraph, factors: FactorCache | None) -> FactorCache:
-    if factors is not None and factors.graph is not graph:
-        raise ValueError("the factors belong to another pose graph")
-    return factors or FactorCache(graph)
-
-
-def _solution(
-    graph: PoseGraph, start: FloatArray, poses: FloatArray, closure_weights: FloatArray, iterations: int, cost: float
-) -> Solution:
-    """The solution, with each connected component moved so that its first variable is at its initial pose."""
-    weights = np.ones(graph.edge_count)
-    weights[graph.arrays().robust] = closure_weights
-    components = graph.components(weights > 0.0)
-    first = anchors(components)
-    moved = se2.compose(se2.compose(start[first], se2.inverse(poses[first]))[components], poses)
-    moved[first] = start[first]
-    return Solution(frozen(moved), frozen(weights), iterations, cost)
+    The poses to start from, shape (N, 3), are in this frame, too. Each connected component has priors that fix its
+    pose.
+    """
+    # A prior is an edge from the origin of its frame, one more variable, which is held.
+    edges, count = graph.arrays(), len(graph)
+    measured = np.array([prior.pose for prior in priors]).reshape(-1, 3)
+    turn = se2.adjoint(measured * (0.0, 0.0, 1.0))
+    information = turn.swapaxes(1, 2) @ np.array([prior.information for prior in priors]).reshape(-1, 3, 3) @ turn
+    anchored = EdgeArrays(
+        i=np.append(edges.i, np.full(len(priors), count)),
+        j=np.append(edges.j, [prior.variable for prior in priors]).astype(np.int64),
+        T_i_j=np.concatenate((edges.T_i_j, measured)),
+        information=np.concatenate((edges.information, information)),
+        robust=np.zeros(len(edges.i) + len(priors), bool),
+    )
+    poses = np.concatenate((initial, se2.IDENTITY[None]))
+    return minimize(SE2, anchored, poses, np.arange(count + 1) == count)[0][:count]

@@ -1,8 +1,8 @@
 """A pose graph in the plane: variables numbered from 0, measured motions between them. It only grows."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,29 @@ PROBABILITY = 0.99
 """Probability with which the error of a true closure passes the chi-square test."""
 CHI2_LIMIT = 11.344866730144373
 """Chi-square of a motion, with its three degrees of freedom, for this probability."""
+
+
+class Group(NamedTuple):
+    """A group of rigid motions, as least squares on it sees it: functions of arrays with one pose each row."""
+
+    residual: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+    """``r = log(T^-1 x_i^-1 x_j)`` of measurements T and poses x_i and x_j, shape (E, d)."""
+    jacobians: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+    """Of r, x_i and x_j: ``A`` and ``B``, shape (E, d, d); a step changes the residual by ``A d_i + B d_j``."""
+    retract: Callable[[FloatArray, FloatArray], FloatArray]
+    """``x exp(d)`` of poses x and a step d, shape (N, d)."""
+
+
+def _residual(T_i_j: FloatArray, x_i: FloatArray, x_j: FloatArray) -> FloatArray:
+    return se2.log(se2.between(T_i_j, se2.between(x_i, x_j)))
+
+
+def _jacobians(residual: FloatArray, x_i: FloatArray, x_j: FloatArray) -> tuple[FloatArray, FloatArray]:
+    of_j = se2.log_jacobian(residual)
+    return -of_j @ se2.adjoint(se2.between(x_j, x_i)), of_j
+
+
+SE2 = Group(_residual, _jacobians, lambda poses, step: se2.compose(poses, se2.exp(step)))
 
 
 class Rows(Generic[Scalar]):
@@ -184,9 +207,18 @@ class PoseGraph:
         self._bounded = self.edge_count
         return EdgeArrays(self._i.values, self._j.values, self._T_i_j.values, information, self._robust.values)
 
-    def restricted(self, poses: FloatArray, kept: NDArray[np.bool_]) -> "PoseGraph":
-        """All variables, at ``poses`` (N, 3), with the edges where ``kept`` (E,) is true."""
-        return PoseGraph.restored(poses, self.given().select(kept))
+    def restricted(
+        self, poses: FloatArray, kept: NDArray[np.bool_], variables: NDArray[np.bool_] | None = None
+    ) -> "PoseGraph":
+        """The graph at ``poses`` (N, 3) with the edges where ``kept`` (E,) is true.
+
+        ``variables`` (N,) marks those that stay, with new numbers, and the edges between them; None: all.
+        """
+        if variables is None:
+            return PoseGraph.restored(poses, self.given().select(kept))
+        edges, number = self.given(), np.cumsum(variables) - 1
+        edges = edges.select(kept & variables[edges.i] & variables[edges.j])
+        return PoseGraph.restored(poses[variables], replace(edges, i=number[edges.i], j=number[edges.j]))
 
     def chi2(self, poses: ArrayLike | None = None, rows: NDArray[np.int64] | None = None) -> FloatArray:
         """Squared Mahalanobis length of the edges' residuals at ``poses`` (N, 3); None: initial poses.
@@ -195,20 +227,18 @@ class PoseGraph:
         """
         x = self.poses() if poses is None else np.asarray(poses, dtype=np.float64)
         edges, chosen = self.arrays(), slice(None) if rows is None else rows
-        # The residual that the solver minimises: the logarithm, not the difference of coordinates.
-        measured = se2.between(x[edges.i[chosen]], x[edges.j[chosen]])
-        residual = se2.log(se2.between(edges.T_i_j[chosen], measured))
+        residual = SE2.residual(edges.T_i_j[chosen], x[edges.i[chosen]], x[edges.j[chosen]])
         chi2: FloatArray = np.einsum("ea,eab,eb->e", residual, edges.information[chosen], residual)
         return chi2
 
     def components(self, kept: ArrayLike | None = None) -> NDArray[np.int64]:
-        """Number of the connected component of each variable, shape (N,), counted in the order of first variables.
+        """First variable of the connected component of each variable, shape (N,).
 
         ``kept``, shape (E,), marks the edges that connect; None: all.
         """
-        edges = self.arrays()
-        mask = np.ones(len(edges.i), dtype=bool) if kept is None else np.asarray(kept, dtype=bool)
-        return np.unique(_first_connected(edges.i[mask], edges.j[mask], len(self)), return_inverse=True)[1]
+        edges = self.arrays() if kept is None else self.arrays().select(np.asarray(kept, dtype=bool))
+        first: NDArray[np.int64] = _first_connected(edges.i, edges.j, len(self))
+        return first
 
 
 @njit
@@ -229,11 +259,6 @@ def _root(first, variable):  # type: ignore[no-untyped-def]
         first[variable] = first[first[variable]]
         variable = first[variable]
     return variable
-
-
-def anchors(components: NDArray[np.int64]) -> NDArray[np.int64]:
-    """First variable of each connected component, shape (C,); ``components`` as from ``PoseGraph.components``, (N,)."""
-    return np.unique(components, return_index=True)[1].astype(np.int64)
 
 
 def _bounded(information: FloatArray) -> FloatArray:

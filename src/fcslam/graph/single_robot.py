@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from fcslam.graph.chains import Chains, find_chains
 from fcslam.graph.consistency import Closures, count_supporting_closures
-from fcslam.graph.factors import FactorCache
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.optimizer import Solution, optimize_gnc, refine_inliers
 from fcslam.graph.pose_graph import PoseGraph
@@ -15,7 +13,7 @@ _UNMEASURED_VARIANCE = 1e6
 """Variance of a step that no odometry measured, m^2 and rad^2."""
 
 
-def solve_single_robot(graph: PoseGraph, factors: FactorCache | None = None) -> Solution:
+def solve_single_robot(graph: PoseGraph) -> Solution:
     """Optimize the graph of one robot robustly; its variables are in the order of its path.
 
     Returns the cheapest of three solutions; the value of the truncated loss, which has many minima, ranks them:
@@ -28,14 +26,13 @@ def solve_single_robot(graph: PoseGraph, factors: FactorCache | None = None) -> 
 
     Args:
         graph: N variables and E edges of one robot.
-        factors: those of ``graph``, where they are built already.
 
     Returns:
         Poses (N, 3) in the frame of the first variable, and weights (E,).
     """
-    robust, factors = graph.arrays().robust, factors or FactorCache(graph, find_chains(graph))
+    robust = graph.arrays().robust
     odometry = initialize(graph, (~robust).astype(float))
-    by_odometry = refine_inliers(graph, odometry, ~robust, factors=factors)
+    by_odometry = refine_inliers(graph, odometry, ~robust)
     if not robust.any():
         return by_odometry
     supported = ~robust
@@ -44,29 +41,15 @@ def solve_single_robot(graph: PoseGraph, factors: FactorCache | None = None) -> 
     path = robot_trajectory(graph, odometry)
     supported[robust] = count_supporting_closures(path, path, closures) > 0
     supported_graph = graph.restricted(graph.poses(), supported)
-    first = optimize_gnc(
-        supported_graph,
-        _robust_start(supported_graph, factors.chains),
-        factors=factors.restricted(supported_graph, supported[robust]),
-    )
+    first = optimize_gnc(supported_graph, initialize_robust(supported_graph))
     weights = np.zeros(len(robust))
     weights[supported] = first.weights
     solutions = (
         by_odometry,
-        refine_inliers(graph, first.poses, weights, factors=factors),
-        optimize_gnc(graph, odometry, factors=factors),
+        refine_inliers(graph, first.poses, weights),
+        optimize_gnc(graph, odometry),
     )
     return min(solutions, key=lambda solution: solution.cost)
-
-
-def _robust_start(graph: PoseGraph, chains: Chains | None) -> FloatArray:
-    """Initial poses (N, 3) that false closures hardly bend; those inside of chains follow from the ends."""
-    if chains is None:
-        return initialize_robust(graph)
-    poses = graph.poses()
-    poses[chains.kept] = initialize_robust(chains.contract(graph))
-    chains.expand(poses)
-    return poses
 
 
 def robot_trajectory(graph: PoseGraph, poses: FloatArray) -> Trajectory:

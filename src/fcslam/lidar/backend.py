@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.graph.factors import FactorCache, Loss
+from fcslam.graph.least_squares import Loss
 from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.trajectory import transport_covariance
@@ -51,7 +51,6 @@ class LidarBackend:
         self._gate = config.keyscans
         self._closer = LoopCloser(recognizer)
         self._graph = PoseGraph()
-        self._factors = FactorCache(self._graph)
         self._poses = np.empty((0, 3))
         """``T_map_base`` of each anchor, optimized."""
         self._window: list[MappedKeyscan] = []
@@ -77,7 +76,7 @@ class LidarBackend:
     def optimized(self) -> FloatArray:
         """``T_map_base`` of every anchor after a robust solve (GNC), shape (S, 3), metres and radians."""
         if self._closer.has_closures:
-            self._poses = optimize_gnc(self._graph, self._poses, factors=self._factors).poses
+            self._poses = optimize_gnc(self._graph, self._poses).poses
         return self._poses
 
     def keyscan_poses(self) -> FloatArray:
@@ -87,7 +86,7 @@ class LidarBackend:
             return local
         poses = self._poses
         if self._closer.has_closures:
-            poses = optimize_gnc(self._graph, poses, factors=self._factors).poses
+            poses = optimize_gnc(self._graph, poses).poses
         before = np.maximum(np.searchsorted(anchors, np.arange(len(local)), "right") - 1, 0)
         return se2.compose(poses[before], se2.between(local[anchors[before]], local))
 
@@ -153,7 +152,7 @@ class LidarBackend:
             self.optimized()
             self._unsolved = 0
         elif self._unsolved >= enough or any(c.is_surprising for c in closures):
-            self._poses = optimize(self._graph, self._poses, loss=Loss.CAUCHY, factors=self._factors).poses
+            self._poses = optimize(self._graph, self._poses, loss=Loss.CAUCHY).poses
             self._unsolved = 0
 
 

@@ -24,7 +24,7 @@ State = dict[str, Any]
 """JSON values and, below any depth of dictionaries with keys of text, arrays."""
 
 _HASH_BYTES = 32
-_LIBRARIES = ("numpy", "scipy", "numba", "gtsam", "opencv-python-headless")
+_LIBRARIES = ("numpy", "scipy", "numba", "opencv-python-headless")
 
 
 def write_state(path: Path, fits: str, state: State) -> None:
