@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fcslam.lidar.evidence import SURFACE_NATS, over_steps, resolve, surface_gain, surfaces
+from fcslam.lidar.evidence import SURFACE_NATS, over_steps, resolve, surface_gains, surfaces
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.odometry import OdometryError
@@ -68,8 +68,7 @@ def test_a_surface_counts_once_whatever_its_number_of_points():
     here, off = (match_scan(scan, field, np.array((x, 0.0, 0.0)), HELD) for x in (0.0, 0.3))
     gains = here.log_likelihoods - off.log_likelihoods
     assert gains.sum() > 2.0 * SURFACE_NATS
-    assert surface_gain(scan, gains) == pytest.approx(SURFACE_NATS)
-    assert surface_gain(scan, -gains) == pytest.approx(-SURFACE_NATS)
+    assert surface_gains(scan, gains) == pytest.approx([gains.sum()])
 
 
 def test_gaps_and_corners_end_surfaces():

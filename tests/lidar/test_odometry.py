@@ -47,6 +47,19 @@ def test_trust_in_perfect_odometry_is_bounded():
     assert trust.position == trust.heading == LEAST_TRUST
 
 
+@pytest.mark.parametrize("slips", [0.0, 0.05])
+def test_the_ratios_of_distance_and_turn_are_learned(slips):
+    """Wheels of another radius and another distance between them; slips are outliers."""
+    rng, trust = np.random.default_rng(4), OdometryTrust()
+    true = np.column_stack((rng.uniform(0.0, 0.1, 800), np.zeros(800), rng.normal(0.0, 0.1, 800)))
+    measured = true * (1.04, 1.0, 0.96) + (rng.random((800, 1)) < slips) * (0.08, 0.0, 0.1)
+    for moved, odometry in zip(true, measured, strict=True):
+        innovation = moved - trust.motion(tuple(odometry)) + rng.normal(0.0, 0.003, 3)
+        trust = trust.learn(innovation, OdometryError(0.04, 0.03), tuple(odometry))
+    assert trust.distance.value == pytest.approx(1.0 / 1.04, abs=0.01)
+    assert trust.turn.value == pytest.approx(1.0 / 0.96, abs=0.01)
+
+
 def test_the_likelihood_has_heavy_tails():
     """Ten standard deviations cost a few nats, not fifty: clear scans must be able to overrule odometry."""
     assert MODEL.log_likelihood(np.zeros(3)) == 0.0

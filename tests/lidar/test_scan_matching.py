@@ -50,6 +50,17 @@ def test_headings_across_the_cut_are_near(field):
     assert -np.pi <= found.T_field_base[2] < np.pi
 
 
+def test_a_prior_with_a_tail_gives_way_where_the_points_contradict_it(field):
+    """A slip of ten standard deviations hardly holds the match; a small deviation is held as by a normal prior."""
+    truth, prior = np.array([0.3, -0.1, 0.4]), np.diag((1e4, 1e4, 1e4))
+    scan = scan_at(truth, room())
+    slipped, near = truth + np.array((0.1, -0.1, 0.1)), truth + np.array((0.003, 0.0, 0.0))
+    held, loose = (match_scan(scan, field, slipped, prior, prior_tail=tail).T_field_base for tail in (np.inf, 3.0))
+    assert error(loose, truth)[0] < 0.3 * error(held, truth)[0]
+    stiff, soft = (match_scan(scan, field, near, prior, prior_tail=tail).T_field_base for tail in (np.inf, 3.0))
+    assert error(soft, stiff)[0] < 1e-3
+
+
 @pytest.mark.parametrize("heading", [0.0, 0.6, np.pi / 2])
 def test_a_corridor_is_fixed_across_and_held_by_the_prior_along(heading):
     rng = np.random.default_rng(1)

@@ -87,20 +87,22 @@ def resolve(
     if distance2 < NEAR**2 or (is_clear and not is_far):
         return match, False
     trusting = match_scan(scan, field, T_field_guess, CORRELATED * error.information, velocity_information)
-    gain = surface_gain(scan, match.log_likelihoods - trusting.log_likelihoods)
+    gains = surface_gains(scan, match.log_likelihoods - trusting.log_likelihoods)
+    if is_far and is_seen and gains.max(initial=0.0) <= SURFACE_NATS:  # no surface alone pulls the match: wheels slip
+        return match, False
+    gain = float(np.clip(gains, -SURFACE_NATS, SURFACE_NATS).sum())
     gain += error.log_likelihood(innovation)
     gain -= error.log_likelihood(se2.motion(T_field_guess, trusting.T_field_base))
     gain += CLEAR_GAIN * is_clear
     return (match, False) if gain > 0.0 and (is_seen or not is_far) else (trusting, is_far)
 
 
-def surface_gain(scan: PointScan, gains: FloatArray) -> float:
-    """Gain (N,) of a scan's log-likelihood at one pose over another, where each surface adds at most ``SURFACE_NATS``.
+def surface_gains(scan: PointScan, gains: FloatArray) -> FloatArray:
+    """Sum of the points' gains (N,) on each surface of a scan, shape (S,).
 
     Points without a normal do not count: rough ground has none, and at corners they belong to two surfaces.
     """
-    by_surface = np.bincount(surfaces(scan), gains * scan.normals.any(axis=1))
-    return float(np.clip(by_surface, -SURFACE_NATS, SURFACE_NATS).sum())
+    return np.bincount(surfaces(scan), gains * scan.normals.any(axis=1))
 
 
 def surfaces(scan: PointScan) -> NDArray[np.intp]:

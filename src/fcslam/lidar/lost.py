@@ -192,7 +192,7 @@ def drove_on(
         last = before.get(now.laser.T_base_laser)
         if last is None or last.laser != now.laser:
             continue
-        x, y, turn = motion = se2.between(last.T_odom_base, now.T_odom_base)
+        x, y, turn = motion = trust.motion(se2.motion(last.T_odom_base, now.T_odom_base))
         error = trust.scale(odometry_error(math.hypot(x, y), abs(float(turn)), odometry))
         field = SurfelField(np.zeros(3))
         field.insert(point_scan(last.matched_ranges_m, last.laser, last.sweep), np.zeros(3))

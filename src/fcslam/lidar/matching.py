@@ -1,5 +1,6 @@
 """Scan matching: Gauss-Newton on the distances of a scan's points to the nearest surfels."""
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -84,6 +85,7 @@ def match_scan(
     velocity_information: FloatArray = FIXED,
     wide_scale_m: float = WIDE_SCALE_M,
     clutter_scale_m: float = NARROW_SCALE_M,
+    prior_tail: float = math.inf,
 ) -> ScanMatch:
     """Find the pose that minimises the robust distances of the points to the field, with a prior at the guess.
 
@@ -98,6 +100,8 @@ def match_scan(
         velocity_information: of the assumed velocity (x, y, theta), shape (3,), in (m/s)^-2 and (rad/s)^-2.
         wide_scale_m: scale of the robust loss at the first step, metres.
         clutter_scale_m: least scale of the loss of points without a normal, metres.
+        prior_tail: degrees of freedom of the prior, a Student t distribution of the position and one of the heading;
+            infinity for a normal distribution.
     """
     return ScanMatch(
         *_match(
@@ -108,6 +112,7 @@ def match_scan(
             field.arrays,
             wide_scale_m,
             clutter_scale_m,
+            prior_tail,
         )
     )
 
@@ -127,11 +132,12 @@ class _Loss(NamedTuple):
 
 
 @njit
-def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: ignore[no-untyped-def]
+def _match(scan, guess, prior, velocity_prior, field, wide, clutter, tail):  # type: ignore[no-untyped-def]
     """Gauss-Newton while the scale of the loss shrinks from ``wide`` to ``NARROW_SCALE_M``, in clutter to ``clutter``.
 
-    It minimises sum_i rho(e_i)^2 / sigma^2 + (pose - guess)^T prior (pose - guess) + p_x v_x^2 + p_y v_y^2
-    + log(1 + p_theta v_theta^2), with p the ``velocity_prior``: a robot that drives straight may begin to turn within a
+    It minimises sum_i rho(e_i)^2 / sigma^2 + tail log(1 + d^2 / tail) + p_x v_x^2 + p_y v_y^2
+    + log(1 + p_theta v_theta^2), with d^2 = (pose - guess)^T prior (pose - guess), for position and heading apart if
+    the tail is finite, and with p the ``velocity_prior``: a robot that drives straight may begin to turn within a
     scan, so the prior of the turn rate has the tails of Cauchy's distribution. The Jacobian of e_i over pose and
     velocity v is (J_i, t_i J_i). So the normal equations consist of the sums of J^T J, t J^T J and t^2 J^T J. The Schur
     complement eliminates v.
@@ -146,10 +152,14 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter):  # type: i
         _normal_equations(equations, scan, pose, velocity, field, loss, velocity_prior)
         turned = (pose[2] - guess[2] + np.pi) % (2.0 * np.pi) - np.pi
         difference = pose[0] - guess[0], pose[1] - guess[1], turned
+        squared = prior[0, 0] * difference[0] ** 2 + prior[1, 1] * difference[1] ** 2
+        position = 1.0 / (1.0 + squared / tail)
+        heading = 1.0 / (1.0 + prior[2, 2] * turned**2 / tail)
         for r in range(3):
             for c in range(3):
-                g[r] += prior[r, c] * difference[c]
-                H[r, c] += prior[r, c]
+                weighted = prior[r, c] * (heading if max(r, c) == 2 else position)
+                g[r] += weighted * difference[c]
+                H[r, c] += weighted
             H[r, r] += DAMPING
         step = solve(H, g)
         small = abs(step[0]) + abs(step[1]) < SMALL_STEP_M and abs(step[2]) < SMALL_STEP_RAD

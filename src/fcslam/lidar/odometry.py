@@ -1,7 +1,8 @@
 """Error of the wheel odometry: a model for every robot, and how far this robot's odometry can be trusted.
 
 A good match measures how far odometry was wrong. These innovations, relative to the model, give the robot its own scale
-of the error. Slips are outliers: the error follows a Student t distribution, whose scale is learned robustly.
+of the error. Slips are outliers: the error follows a Student t distribution, whose scale is learned robustly. The part
+that is a share of the motion, as of wheels with another radius, is learned and corrected.
 """
 
 import math
@@ -15,6 +16,9 @@ from fcslam.records import FloatArray
 
 TAIL: float = 1.0
 """Degrees of freedom of the Student t distribution of the error; few, as wheels may slip."""
+PRIOR_TAIL: float = 3.0
+"""The same in the prior of a match once the error is learned. Gauss-Newton starts at odometry: with fewer it would stay
+there."""
 FIRST_MATCHES = 20
 LATEST_MATCHES = 10 * FIRST_MATCHES
 """The model counts as many matches as the first number; later matches replace the oldest of the second number."""
@@ -22,6 +26,9 @@ FIRST_TRUST = 0.5
 """Learned scale before the first match: most robots' odometry is better than the model."""
 LEAST_TRUST = 0.1
 """Least learned scale: matches have an error of their own."""
+FIRST_WEIGHT, LARGEST_WEIGHT = 0.05, 3.0
+"""Sum of squared motions (m^2 or rad^2) that a ratio of 1 counts as before the first match, and the largest sum, beyond
+which the oldest matches are forgotten: tyres wear."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +90,21 @@ def odometry_error(moved_m: float, turned_rad: float, model: OdometryModel) -> O
     )
 
 
+class MotionRatio(NamedTuple):
+    """How far a robot moves, or turns, per motion that its odometry measures, by recursive least squares."""
+
+    value: float = 1.0
+    weight: float = FIRST_WEIGHT
+
+    def learn(self, squared: float, product: float) -> "MotionRatio":
+        """Learn from a motion: its square, and its product with what the corrected motion lacks, both weighted."""
+        weight = min(self.weight + squared, LARGEST_WEIGHT)
+        return MotionRatio(self.value + product / weight, weight)
+
+
+_UNLEARNED = MotionRatio()
+
+
 @dataclass(frozen=True, slots=True)
 class OdometryTrust:
     """The error of one robot's odometry relative to the model, as learned from its good matches."""
@@ -91,23 +113,45 @@ class OdometryTrust:
     heading: float = FIRST_TRUST
     matches: int = 0
     """Number of matches that it was learned from."""
+    distance: MotionRatio = _UNLEARNED
+    turn: MotionRatio = _UNLEARNED
+
+    def motion(self, measured: Pose) -> Pose:
+        """The robot's motion (x, y, theta) where odometry measured another."""
+        x, y, theta = measured
+        return self.distance.value * x, self.distance.value * y, self.turn.value * theta
 
     def scale(self, error: OdometryError) -> OdometryError:
         """The error of this robot for a motion with ``error`` by the model."""
         return OdometryError(self.position * error.position_m, self.heading * error.heading_rad)
 
-    def learn(self, innovation: Pose, error: OdometryError) -> "OdometryTrust":
-        """Learn from the pose of a good match relative to that by odometry, whose error by the model is ``error``."""
+    def learn(self, innovation: Pose, error: OdometryError, measured: Pose = (0.0, 0.0, 0.0)) -> "OdometryTrust":
+        """Learn from a good match.
+
+        Args:
+            innovation: pose of the match relative to that by ``motion``, metres and radians.
+            error: error of odometry by the model.
+            measured: motion by odometry since the last match; zeros if nothing is to be learned about its ratios.
+        """
         rate = 1.0 / min(FIRST_MATCHES + self.matches, LATEST_MATCHES)
-        x, y, theta = innovation
+        own = self.scale(error)
+        (x, y, theta), (dx, dy, turn) = innovation, measured
+        weight = _outlier_weight((x * x + y * y) / own.position_m**2)
+        turn_weight = _outlier_weight((theta / own.heading_rad) ** 2)
         return OdometryTrust(
             _learned_scale(self.position, 0.5 * (x * x + y * y) / error.position_m**2, rate),
             _learned_scale(self.heading, theta * theta / error.heading_rad**2, rate),
             self.matches + 1,
+            self.distance.learn(weight * (dx * dx + dy * dy), weight * (dx * x + dy * y)),
+            self.turn.learn(turn_weight * turn * turn, turn_weight * turn * theta),
         )
+
+
+def _outlier_weight(squared: float) -> float:
+    """Weight of an error with this squared Mahalanobis length in one direction: slips have little."""
+    return (TAIL + 1.0) / (TAIL + squared)
 
 
 def _learned_scale(scale: float, squared: float, rate: float) -> float:
     """One step of the recursive estimate of a Student t distribution's scale: an outlier has little weight."""
-    weight = (TAIL + 1.0) / (TAIL + squared / scale**2)
-    return max(LEAST_TRUST, math.sqrt(scale**2 + rate * (weight * squared - scale**2)))
+    return max(LEAST_TRUST, math.sqrt(scale**2 + rate * (_outlier_weight(squared / scale**2) * squared - scale**2)))

@@ -11,7 +11,7 @@ from fcslam.lidar.correlative import SearchWindow, search
 from fcslam.lidar.evidence import CLEAR, CLEAR_GAIN, FAR, LEAST_KNOWN, over_steps, resolve
 from fcslam.lidar.field import CELL_M, SurfelField
 from fcslam.lidar.matching import FIXED, WIDE_SCALE_M, ScanMatch, match_scan
-from fcslam.lidar.odometry import OdometryError, OdometryModel, OdometryTrust, odometry_error
+from fcslam.lidar.odometry import FIRST_MATCHES, PRIOR_TAIL, OdometryError, OdometryModel, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import FloatArray, LaserScan, Sweep
 from fcslam.sources.motion import STILL_M, STILL_RAD
@@ -31,6 +31,8 @@ USUAL_WEIGHT, USUAL_STEP = 0.05, 0.1
 """The usual log-likelihood per point follows each match with this weight, and by at most this difference."""
 LARGEST_VELOCITY = 30.0
 """Largest velocity of a robot in a sweep, m/s and rad/s: a match that says more is wrong."""
+PRIOR_SCALE = 3.0
+"""Standard deviation of odometry as the prior of a match, per learned one: points count fully in the matcher."""
 UNSURE_M = 0.05
 """Learned standard deviation of odometry, in metres, beyond which a match has several starts. After a long step a match
 may end at a maximum of the likelihood that is nearer to odometry than the right one."""
@@ -165,7 +167,7 @@ class ScanTracker:
             match.T_field_base,
             scan.T_odom_base,
             matched_here=matched_here,
-            trust=state.trust.learn(innovation, error) if learns else state.trust,
+            trust=state.trust.learn(innovation, error, self._measured(scan)) if learns else state.trust,
             usual=_learn_usual(state.usual, match.log_likelihood / max(1, len(thinned))),
         )
         return TrackingResult(tracked, accepted, match.explained, match.known)
@@ -203,13 +205,20 @@ class ScanTracker:
         """The state moved by odometry to a scan that is not matched."""
         state = self._state
         last = scan.T_odom_base if state.T_odom_base is None else state.T_odom_base
-        x, y, turn = motion = se2.motion(last, scan.T_odom_base)
+        x, y, turn = motion = state.trust.motion(se2.motion(last, scan.T_odom_base))
         return state._replace(
             T_local_base=se2.compose(state.T_local_base, motion),
             T_odom_base=scan.T_odom_base,
             moved_m=state.moved_m + math.hypot(x, y),
             turned_rad=state.turned_rad + abs(turn),
         )
+
+    def _measured(self, scan: LaserScan) -> se2.Pose:
+        """Motion that odometry measured since the last match; zeros if the last scan was not matched."""
+        last = self._state.T_odom_base
+        if not self._odometry.is_measured or last is None or self._state.moved_m > 0.0:
+            return 0.0, 0.0, 0.0
+        return se2.motion(last, scan.T_odom_base)
 
     def _is_long_step(self, T_local_guess: FloatArray) -> bool:
         x, y, theta = se2.motion(self._state.T_local_base, T_local_guess)
@@ -241,7 +250,12 @@ class ScanTracker:
         if self._is_unsure(error):
             match = _likeliest(thinned, field, T_local_guess, learned, velocity)
         else:
-            match = match_scan(thinned, field, T_local_guess, error.information, velocity)
+            prior = OdometryError(
+                min(error.position_m, PRIOR_SCALE * learned.position_m),
+                min(error.heading_rad, PRIOR_SCALE * learned.heading_rad),
+            )
+            tail = PRIOR_TAIL if self._state.trust.matches >= FIRST_MATCHES else math.inf
+            match = match_scan(thinned, field, T_local_guess, prior.information, velocity, prior_tail=tail)
         innovation = se2.motion(T_local_guess, match.T_field_base)
         log_posterior = match.log_likelihood + learned.log_likelihood(innovation)
         is_doubtful = match.explained < DOUBTFUL * match.known or learned.mahalanobis2(innovation) >= FAR**2

@@ -195,7 +195,7 @@ def _is_wrong(scale: Estimate | None) -> TypeGuard[Estimate]:
 
 
 def _is_of_wheels(scale: Estimate) -> bool:
-    """Whether the distances by odometry may be wrong by so much; else the unit of the ranges may be."""
+    """Whether odometry may be wrong by so much; else the unit of the ranges may be."""
     return 1.0 / LARGEST_WHEEL_SCALE < scale.value < LARGEST_WHEEL_SCALE
 
 
@@ -221,9 +221,8 @@ def _scale_lines(calibration: MotionCalibration, beams: Beams) -> Iterator[str]:
 
 
 def _scale_line(name: str, scale: Estimate, remedy: str) -> str:
-    return (
-        f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f}); not corrected: {remedy}"
-    )
+    state = "mapping follows the scans" if _is_of_wheels(scale) else "not corrected"
+    return f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f}); {state}: {remedy}"
 
 
 def calibrated(source: Source, config: LidarConfig) -> Source:
