@@ -102,7 +102,7 @@ def surface_gains(scan: PointScan, gains: FloatArray) -> FloatArray:
 
     Points without a normal do not count: rough ground has none, and at corners they belong to two surfaces.
     """
-    return np.bincount(surfaces(scan), gains * scan.normals.any(axis=1))
+    return np.bincount(surfaces(scan), gains * scan.normals.any(axis=1)).astype(np.float64)
 
 
 def surfaces(scan: PointScan) -> NDArray[np.intp]:

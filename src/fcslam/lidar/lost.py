@@ -197,7 +197,7 @@ def drove_on(
         field = SurfelField(np.zeros(3))
         field.insert(point_scan(last.matched_ranges_m, last.laser, last.sweep), np.zeros(3))
         scan = point_scan(now.matched_ranges_m, now.laser, now.sweep).thinned(POINT_SPACING_M, POINT_LIMIT)
-        match = match_scan(scan, field, motion, CORRELATED * error.information)
+        match = match_scan(scan, field, np.array(motion), CORRELATED * error.information)
         if match.known >= LEAST_KNOWN and match.explained >= LOST_EXPLAINED * match.known:
             return True
     return False
