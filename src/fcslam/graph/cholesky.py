@@ -55,6 +55,44 @@ def solve(
         The variables, and half the gradient where they are zero, shape (N, d) each. The variables are NaN if the normal
         equations are not positive definite.
     """
+    gradient, *factor = _factorized(structure, jacobians, information, residual, held, damping)
+    x = -gradient[..., None]
+    _substitute(*factor, x)
+    return x[structure[2], :, 0], gradient[structure[2]]
+
+
+def marginal_covariance(
+    structure: Structure,
+    jacobians: tuple[FloatArray, FloatArray],
+    information: FloatArray,
+    held: NDArray[np.bool_],
+    wanted: _Numbers,
+) -> FloatArray:
+    """Marginal covariance of some variables, shape (W d, W d), where the edges measure with this information.
+
+    ``wanted``: the variables, shape (W,); those that are held have none. Other arguments as of ``solve``.
+    """
+    edges, height, size = jacobians[0].shape
+    _, *factor = _factorized(structure, jacobians, information, np.zeros((edges, height)), held, 0.0)
+    result = np.zeros((len(wanted), size, len(wanted), size))
+    rows = structure[2][wanted]
+    for column in np.flatnonzero(~held[wanted]):
+        x = np.zeros((len(held), size, size))
+        x[rows[column]] = np.eye(size)
+        _substitute(*factor, x)
+        result[:, :, column] = x[rows]
+    return result.reshape(len(wanted) * size, -1)
+
+
+def _factorized(
+    structure: Structure,
+    jacobians: tuple[FloatArray, FloatArray],
+    information: FloatArray,
+    residual: FloatArray,
+    held: NDArray[np.bool_],
+    damping: float,
+) -> tuple[FloatArray, _Numbers, _Numbers, FloatArray, FloatArray]:
+    """The gradient by row, and the factor as ``_substitute`` takes it."""
     i, j, row, block, starts, rows = structure
     of_i, of_j = (np.where(held[ends, None, None], 0.0, of) for ends, of in zip((i, j), jacobians, strict=True))
     size = of_i.shape[2]
@@ -62,12 +100,9 @@ def solve(
     diagonal[row] = np.where(held, 1.0, damping)[:, None, None] * np.eye(size)
     gradient = np.zeros((len(row), size))
     _assemble(row[i], row[j], block, of_i, of_j, information, residual, diagonal, lower, gradient)
-    x = -gradient
-    if _factorize(starts, rows, diagonal, lower):
-        _substitute(starts, rows, diagonal, lower, x)
-    else:
-        x[:] = np.nan
-    return x[row], gradient[row]
+    if not _factorize(starts, rows, diagonal, lower):
+        diagonal[:] = np.nan
+    return gradient, starts, rows, diagonal, lower
 
 
 @njit
@@ -177,33 +212,31 @@ def _divide(block, factor):  # type: ignore[no-untyped-def]
 @njit(allocates=False)
 def _subtract_product(block, left, right):  # type: ignore[no-untyped-def]
     """``block - left right^T``, in place."""
-    for a in range(len(block)):
-        for b in range(len(block)):
+    for a in range(len(left)):
+        for b in range(len(right)):
             product = 0.0
-            for c in range(len(block)):
+            for c in range(left.shape[1]):
                 product += left[a, c] * right[b, c]
             block[a, b] -= product
 
 
 @njit(allocates=False)
 def _substitute(starts, rows, diagonal, lower, x):  # type: ignore[no-untyped-def]
-    """Solve ``L L^T x = b`` in place of b, shape (N, d)."""
-    count, size = x.shape
+    """Solve ``L L^T x = b`` in place of b, shape (N, d, m)."""
+    count, size, width = x.shape
     for column in range(count):
         for a in range(size):
-            for b in range(a):
-                x[column, a] -= diagonal[column, a, b] * x[column, b]
-            x[column, a] /= diagonal[column, a, a]
+            for m in range(width):
+                for b in range(a):
+                    x[column, a, m] -= diagonal[column, a, b] * x[column, b, m]
+                x[column, a, m] /= diagonal[column, a, a]
         for p in range(starts[column], starts[column + 1]):
-            for a in range(size):
-                for b in range(size):
-                    x[rows[p], a] -= lower[p, a, b] * x[column, b]
+            _subtract_product(x[rows[p]], lower[p], x[column].T)
     for column in range(count - 1, -1, -1):
         for p in range(starts[column], starts[column + 1]):
-            for a in range(size):
-                for b in range(size):
-                    x[column, a] -= lower[p, b, a] * x[rows[p], b]
+            _subtract_product(x[column], lower[p].T, x[rows[p]].T)
         for a in range(size - 1, -1, -1):
-            for b in range(a + 1, size):
-                x[column, a] -= diagonal[column, b, a] * x[column, b]
-            x[column, a] /= diagonal[column, a, a]
+            for m in range(width):
+                for b in range(a + 1, size):
+                    x[column, a, m] -= diagonal[column, b, a] * x[column, b, m]
+                x[column, a, m] /= diagonal[column, a, a]

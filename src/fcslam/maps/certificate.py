@@ -10,18 +10,18 @@ errors are larger: ``CONTRADICTED``.
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from fcslam.graph.pose_graph import PoseGraph
+from fcslam.geometry import se2
+from fcslam.graph.cholesky import find_structure, marginal_covariance
+from fcslam.graph.pose_graph import SE2, Edge, PoseGraph
 from fcslam.lidar.verification import CLOSURE_SIGMA_M
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, pixels_of
 from fcslam.records import FloatArray
@@ -54,7 +54,6 @@ AGAIN_PER_M: Final = 0.1 * AGAIN_M
 """Standard deviation of the motion that another drive between two places measures: constant, and by metre."""
 UNKNOWN_INFORMATION: Final = 1e-4
 """Information about the pose of keyscans that no edge connects with the first one."""
-_SYMMETRIC: Final[dict[str, Any]] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 _S: Final = np.array(((0.0, -1.0), (1.0, 0.0)))
 
 
@@ -151,18 +150,13 @@ def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
     variables = np.concatenate([path.variables for path in paths])
     rows = np.full(len(graph), -1)
     rows[variables] = np.arange(len(variables))
-    information = _information(graph, poses, rows)
-    # What no edge connects with the first keyscan is held weakly, so that it counts as unknown.
-    component = connected_components(information, directed=False)[1][::3]
-    begins = np.unique(component, return_index=True)[1]
-    weak = np.zeros((len(variables), 3))
-    weak[begins[component[begins] != component[0]]] = UNKNOWN_INFORMATION
-    information = csc_array(information + diags_array(weak.ravel()))
-    chosen = _sampled(poses)
-    covariance = np.zeros((3 * len(chosen), 3 * len(chosen)))
-    if len(chosen) > 1:
-        wanted = (3 * chosen[1:, None] + np.arange(3)).ravel() - 3
-        covariance[3:, 3:] = _marginal(csc_array(information[3:, 3:]), wanted)
+    part, chosen = _part(graph, poses, rows).arrays(), _sampled(poses)
+    held, no_residual = np.arange(len(poses)) == 0, np.zeros((len(part.i), 3))
+    jacobians = SE2.jacobians(no_residual, poses[part.i], poses[part.j])
+    structure = find_structure(part.i, part.j, len(poses))
+    in_bases = marginal_covariance(structure, jacobians, part.information, held, chosen).reshape(len(chosen), 3, -1, 3)
+    turn = se2.adjoint(poses[chosen] * (0.0, 0.0, 1.0))
+    covariance = np.einsum("pab,pbqc,qdc->paqd", turn, in_bases, turn, optimize=True).reshape(3 * len(chosen), -1)
     scale = max(SCALE, CONTRADICTED * _contradiction(graph, rows, len(variables)))
     return Places(variables[chosen], poses[chosen], covariance * scale**2, scale)
 
@@ -173,23 +167,6 @@ def _contradiction(graph: PoseGraph, rows: NDArray[np.int64], variables: int) ->
     inside = np.flatnonzero((rows[edges.i] >= 0) & (rows[edges.j] >= 0))
     redundant = len(inside) - (variables - 1)
     return math.sqrt(float(graph.chi2(rows=inside).sum()) / (3.0 * redundant)) if redundant > 0 else 0.0
-
-
-def _marginal(information: csc_array, wanted: NDArray[np.int64]) -> FloatArray:
-    """Covariance of the variables ``wanted``: the inverse of the Schur complement of all others, shape (W, W).
-
-    The others are eliminated first. The last block of the factors L U then is the Schur complement.
-    """
-    others = np.setdiff1d(np.arange(information.shape[0]), wanted)
-    if len(others):
-        inner = splu(csc_array(information[others][:, others]), permc_spec="MMD_AT_PLUS_A", **_SYMMETRIC)
-        others = others[np.argsort(inner.perm_c)]
-    order = np.concatenate((others, wanted))
-    factors = splu(csc_array(information[order][:, order]), permc_spec="NATURAL", **_SYMMETRIC)
-    last = slice(len(others), None)
-    schur = factors.L[last, last].toarray() @ factors.U[last, last].toarray()
-    inverse: FloatArray = np.linalg.inv(schur)
-    return 0.5 * (inverse + inverse.T)
 
 
 def relative_error(
@@ -256,22 +233,14 @@ def quality_files(certificates: Mapping[int, Mapping[str, Any]], maps: Mapping[i
     return {f"{QUALITY}.json": certificate_json(certificates), **pictures}
 
 
-def _information(graph: PoseGraph, poses: FloatArray, rows: NDArray[np.int64]) -> csc_array:
-    """Information of errors along the axes of ``map``, shape (3 N, 3 N), of the edges within one map."""
+def _part(graph: PoseGraph, poses: FloatArray, rows: NDArray[np.int64]) -> PoseGraph:
+    """One map. What no edge connects with the first keyscan is held by it weakly, so that it counts as unknown."""
     edges = graph.arrays()
-    inside = (rows[edges.i] >= 0) & (rows[edges.j] >= 0)
-    i, j, weight = rows[edges.i[inside]], rows[edges.j[inside]], edges.information[inside]
-    cos, sin = np.cos(poses[j, 2]), np.sin(poses[j, 2])
-    turn = np.zeros((len(i), 3, 3))  # from map to the base of j
-    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = cos, sin, -sin, cos, 1.0
-    of_i = np.tile(-np.eye(3), (len(i), 1, 1))
-    of_i[:, :2, 2] = -(poses[j, :2] - poses[i, :2]) @ _S.T
-    jacobian = np.concatenate((turn @ of_i, turn), axis=2)  # (E, 3, 6)
-    blocks = jacobian.transpose(0, 2, 1) @ weight @ jacobian  # (E, 6, 6)
-    columns = np.concatenate((3 * i[:, None] + np.arange(3), 3 * j[:, None] + np.arange(3)), axis=1)
-    at = np.broadcast_to(columns[:, :, None], blocks.shape), np.broadcast_to(columns[:, None, :], blocks.shape)
-    size = 3 * len(poses)
-    return csc_array(coo_array((blocks.ravel(), (at[0].ravel(), at[1].ravel())), shape=(size, size)))
+    edges = edges.select((rows[edges.i] >= 0) & (rows[edges.j] >= 0))
+    part = PoseGraph.restored(poses, replace(edges, i=rows[edges.i], j=rows[edges.j]))
+    for begin in np.flatnonzero(part.components() == np.arange(len(poses)))[1:].tolist():
+        part.add_edge(Edge(0, begin, se2.between(poses[0], poses[begin]), UNKNOWN_INFORMATION * np.eye(3), True))
+    return part
 
 
 def _sampled(poses: FloatArray) -> NDArray[np.int64]:
