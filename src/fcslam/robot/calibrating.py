@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Final, TypeGuard
+from typing import TYPE_CHECKING, Final, TypeGuard
 
 import numpy as np
 
@@ -20,12 +20,15 @@ from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.predicted_motion import PREDICTED, MotionPrediction
 from fcslam.robot.wheel_odometry import is_jump
 from fcslam.sources.bags.options import BagCorrection
-from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.contradictions import RepeatedScans
+from fcslam.sources.formats import bag_of
 from fcslam.sources.motion import OdometryUpdates
 from fcslam.sources.pose import pose_of
 from fcslam.sources.returns import FloorLine
 from fcslam.sources.source import Noted, Source
+
+if TYPE_CHECKING:
+    from fcslam.sources.bags.rosbag import RosBag
 
 MOST_JUMPS: Final = 10
 """Odometry that jumps more often is wrong."""
@@ -73,7 +76,7 @@ class Calibrated:
     """A sentence for each correction, with its standard deviation."""
 
 
-def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
+def calibrate_bag(bag: "RosBag", config: LidarConfig) -> Calibrated:
     """Estimate the timing and the mounting of the first laser of a bag with one laser."""
     contradictions = _contradictions(bag)
     floors = tuple(floor for _, floor in contradictions)
@@ -85,7 +88,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     return replace(calibrated, correction=replace(calibrated.correction, floors=floors), lines=lines)
 
 
-def _calibrate_level(bag: RosBag, config: LidarConfig, facings: list[Contradiction | None]) -> Calibrated:
+def _calibrate_level(bag: "RosBag", config: LidarConfig, facings: list[Contradiction | None]) -> Calibrated:
     if len(facings) > 1:
         named = zip(bag.plan.lasers, facings, strict=True)
         lines = tuple(f"{laser.name}: {found}; not corrected" for laser, found in named if found)
@@ -113,7 +116,7 @@ def _calibrate_level(bag: RosBag, config: LidarConfig, facings: list[Contradicti
 
 def contradictions_of(source: Source) -> tuple[str, ...]:
     """Lines about the lasers of a recording of any format that contradict its odometry."""
-    say = str if isinstance(source, RosBag) else _without_tf
+    say = _without_tf if bag_of(source) is None else str
     lines = []
     for laser, (facing, floor) in zip(source.survey().lasers, _contradictions(source), strict=True):
         if facing is not None:
@@ -161,7 +164,7 @@ def _contradictions(source: Source) -> list[tuple[Contradiction | None, FloorLin
     return found
 
 
-def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
+def _calibrate_finely(bag: "RosBag", config: LidarConfig) -> Calibrated:
     survey = bag.survey()
     assumed_s = survey.duration_s / max(1, survey.scan_count - 1)
     if len(survey.lasers) > 1 or not 0.0 < assumed_s < 1.0:
@@ -227,12 +230,13 @@ def _scale_line(name: str, scale: Estimate, remedy: str) -> str:
 
 def calibrated(source: Source, config: LidarConfig) -> Source:
     """A recording with what its motion says against it; only a bag is corrected."""
-    if not isinstance(source, RosBag):
+    bag = bag_of(source)
+    if bag is None:
         said = contradictions_of(source)
         return Noted(source, tuple(f"{line}; not corrected" for line in said)) if said else source
-    found = calibrate_bag(source, config)
-    lines = tuple(f"{source.path}: {line}" for line in found.lines)
-    return source.corrected(found.correction, lines) if lines else source
+    found = calibrate_bag(bag, config)
+    lines = tuple(f"{bag.path}: {line}" for line in found.lines)
+    return bag.corrected(found.correction, lines) if lines else bag
 
 
 def _tracked(
