@@ -177,8 +177,19 @@ def test_a_log_is_mapped_without_bags_plans_servers_and_plots(tmp_path):
     ]
     loaded = set(printed(program, tmp_path).split())
     assert {"fcslam.sources.logs.carmen", "fcslam.maps.drawing"} <= loaded
-    others = "asyncio ssl httpx fastapi matplotlib pandas onnxruntime torch psycopg rosbags".split()
-    unused = "sources.bags.rosbag anchoring.plan anchoring.gnss wire.http_transport live.robot page".split()
+    others = [
+        "asyncio",
+        "ssl",
+        "httpx",
+        "fastapi",
+        "matplotlib",
+        "pandas",
+        "onnxruntime",
+        "torch",
+        "psycopg",
+        "rosbags",
+    ]
+    unused = ["sources.bags.rosbag", "anchoring.plan", "anchoring.gnss", "wire.http_transport", "live.robot", "page"]
     assert not loaded & {*others, *(f"fcslam.{module}" for module in unused)}
 
 
