@@ -5,6 +5,7 @@ EXTRAS ?= dev
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed-$(EXTRAS)
+COMPILED := $(VENV)/.compiled-$(EXTRAS)
 DEMO ?= demo
 SECONDS ?= 60
 # What draws the pictures of simulated cameras where there is no display and no graphics card.
@@ -22,7 +23,8 @@ BIOME := @biomejs/cli-linux-x64@2.3.8
 HAS_BROWSER := $(BIN)/python -c "import playwright, shutil, sys; sys.exit(not shutil.which('chromium'))" 2>/dev/null
 # torch's build for processors is a tenth of the size of the one that PyPI has.
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --no-deps --retries 1 --timeout 15 torch
-PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
+# What is imported is compiled then: a third of the time of an installation, and most modules are never imported.
+PIP := $(BIN)/python -m pip install -qq --no-compile --disable-pip-version-check -c constraints.txt
 HAS_MKDOCS := $(BIN)/python -c "import material, mkdocs, mkdocstrings_handlers.python" 2>/dev/null
 HAS_SCALE := $(BIN)/python -c "import distributed, psycopg" 2>/dev/null
 HAS_LEARNING := $(BIN)/python -c "import flwr, onnx, torch" 2>/dev/null
@@ -32,7 +34,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENC
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n $(shell expr $$(env -u OMP_NUM_THREADS nproc) + 1) --maxprocesses 8 --dist worksteal
 BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/convert_logs.py benchmarks/processes.py benchmarks/quick.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install gl learning demo test test-fast test-system test-all test-training test-attack ros-test browser-test scale-test check bench bench-quick docs proto fuzz lock sbom audit
+.PHONY: help install packages gl learning demo test test-fast test-system test-all test-training test-attack ros-test browser-test scale-test check bench bench-quick docs proto fuzz lock sbom audit
 .DEFAULT_GOAL := help
 # Where this is set, each process of a test compiles the package and the tests anew.
 export PYTHONDONTWRITEBYTECODE :=
@@ -53,6 +55,7 @@ help:
 	@echo "make bench        the benchmarks; those on recordings need FCSLAM_DATA"
 	@echo "make bench-quick  speed and accuracy beside the committed figures, in minutes; needs FCSLAM_DATA"
 	@echo "make install      create .venv; EXTRAS=dev,train,federated,sim adds packages"
+	@echo "make packages     the same, but no code is compiled"
 	@echo "make learning     install torch and Flower, for training the detector, if they are available"
 	@echo "make gl           install the GL library of the simulated cameras, if permitted"
 	@echo "make lock         write deploy/requirements.lock: what a service and a robot install, with hashes"
@@ -61,12 +64,17 @@ help:
 	@echo "make docs         write the reference pages from the code, and the documentation to site/"
 	@echo "make proto        generate the Python code of the wire format"
 
-install: $(INSTALLED)
+install: $(COMPILED)
+
+packages: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@echo "Installing fcslam[$(EXTRAS)] into $(VENV); the first time takes about two minutes."
 	@$(PYTHON) -m venv $(VENV) || { echo "Install Python 3.11, 3.12 or 3.13 with its venv, or name one: make install PYTHON=..."; exit 1; }
 	@$(PIP) -e ".[$(EXTRAS)]"
+	@touch $@
+
+$(COMPILED): $(INSTALLED)
 	@find src -name '*.nb[ic]' -delete  # compiled code that names classes by where they were
 	@$(BIN)/fcslam tools warm-up
 	@touch $@
@@ -89,26 +97,26 @@ learning: $(INSTALLED)
 	    $(HAS_LEARNING) || echo "No torch or no Flower, so no training. To have them: make install EXTRAS=$(EXTRAS),federated"; \
 	fi
 
-demo: gl learning
+demo: $(COMPILED) gl learning
 	@$(BIN)/fcslam demo --output $(DEMO) $$($(HAS_GL) || echo --no-camera)
 
-test: $(INSTALLED)
+test: $(COMPILED)
 	@$(PYTEST) -m "not system and not training"
 
-test-fast: $(INSTALLED)
+test-fast: $(COMPILED)
 	@$(PYTEST) -m "not system and not training and not slow"
 
-test-system: $(INSTALLED)
+test-system: $(COMPILED)
 	@$(PYTEST) -m system -rs
 
-test-all: $(INSTALLED)
+test-all: $(COMPILED)
 	@$(PYTEST) -m "not training" -rs
 
 # Needs what `make learning` installs.
-test-training: $(INSTALLED)
+test-training: $(COMPILED)
 	@$(PYTEST) -m training -rs
 
-test-attack: $(INSTALLED)
+test-attack: $(COMPILED)
 	@$(PYTEST) -m attack -rs
 
 # Never fails: without ROS the tests of live robots are skipped.
@@ -129,7 +137,7 @@ browser-test: $(INSTALLED)
 	    tar xzf axe-core-*.tgz package/axe.min.js; } || echo "No axe-core from npm, so accessibility is not tested."
 
 # Without Dask the tests of a cluster are skipped, without PostgreSQL those of a store that instances share.
-scale-test: $(INSTALLED)
+scale-test: $(COMPILED)
 	@$(HAS_SCALE) || $(PIP) -e ".[$(EXTRAS),distributed,postgres]" || echo "No Dask or no psycopg for this Python."
 	@ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { \
 	    echo "Installing PostgreSQL for the tests of several instances."; \
@@ -138,7 +146,7 @@ scale-test: $(INSTALLED)
 	}
 	@$(PYTEST) -rs tests/cluster tests/service/shared tests/mission/test_mission_store.py tests/cli/test_serve_shared.py tests/test_scale_page.py
 
-fuzz: $(INSTALLED)
+fuzz: $(COMPILED)
 	@folder=$$(mktemp -d) && trap 'rm -r "$$folder"' EXIT && \
 	    $(ONE_THREAD) $(BIN)/python benchmarks/fuzz.py --seconds $(SECONDS) --results "$$folder"
 
@@ -151,10 +159,10 @@ check: $(INSTALLED)
 	    tar xzf *.tgz && chmod +x package/biome; } || echo "No Biome from npm, so the page's script is not checked."
 	@test ! -x $(VENV)/biome/package/biome || $(VENV)/biome/package/biome lint --error-on-warnings
 
-bench: $(INSTALLED)
+bench: $(COMPILED)
 	@set -e; for script in $(BENCHMARKS); do echo "$$script"; $(BIN)/python "$$script"; done
 
-bench-quick: $(INSTALLED)
+bench-quick: $(COMPILED)
 	@$(BIN)/python benchmarks/quick.py
 
 docs: $(INSTALLED)
