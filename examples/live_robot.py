@@ -12,7 +12,7 @@ from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_f
 
 
 def main(folder: str) -> None:
-    settings = SimulationSettings(robots=1, building="office", path_length_m=40.0, camera=None)
+    settings = SimulationSettings(robots=1, building="office", path_length_m=25.0, camera=None)
     simulated = simulate_fleet(settings, seed=1).robots[0]
     with fcslam.Robot("anna", simulated.lasers[0], on_event=lambda event: print(event.text)) as robot:
         for number, scan in enumerate(simulated.scans()):

@@ -3,10 +3,12 @@
 import gc
 import re
 import tempfile
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import typer.main
 from hypothesis import settings
 
 from fcslam.cloud import recognition
@@ -24,7 +26,7 @@ from tests.scripted import ScriptedMatcher
 
 # How long an example takes says something of the machine, and of code that is compiled at its first call.
 # More examples find little that these do not; `make fuzz` tries thousands of broken inputs.
-settings.register_profile("fcslam", deadline=None, max_examples=40)
+settings.register_profile("fcslam", deadline=None, max_examples=30)
 settings.load_profile("fcslam")
 
 
@@ -83,6 +85,14 @@ def networks_tried_once():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(network_check, "_try", try_once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def commands_built_once():
+    """typer makes all commands and options anew for each command; they are always the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("typer.main.get_command", cache(typer.main.get_command))
         yield
 
 

@@ -3,6 +3,7 @@
 import re
 import shlex
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,7 @@ def test_every_setting_exists(page):
     assert [key for key in sorted(named) if not is_setting(key)] == []
 
 
+@cache
 def defined_tests() -> set[str]:
     files = sorted((ROOT / "tests").rglob("test_*.py"))
     return {name for file in files for name in re.findall(r"^def (test_\w+)\(", file.read_text("utf-8"), re.MULTILINE)}

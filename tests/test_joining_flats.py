@@ -64,7 +64,7 @@ def test_flats_with_equal_walls_and_other_furniture_stay_apart_whatever_the_star
 @pytest.fixture(scope="module")
 def far_apart():
     """Two robots in one corridor that never met."""
-    ways = {"a": [(4.0, 0.0), (12.0, 0.1), (5.0, 0.0)], "b": [(26.0, 0.0), (34.0, 0.1), (27.0, 0.0)]}
+    ways = {"a": [(4.0, 0.0), (10.0, 0.1), (5.0, 0.0)], "b": [(26.0, 0.0), (32.0, 0.1), (27.0, 0.0)]}
     return [Drive(name, way, doors()) for name, way in ways.items()]
 
 

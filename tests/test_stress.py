@@ -22,7 +22,7 @@ def run(script, *options):
 def test_the_same_map_whatever_happens(tmp_path):
     """A network that spares nothing."""
     scenarios = ["--scenarios", "all at once", "disk full"]
-    run("faults.py", *scenarios, "--robots", "2", "--path", "25", "--results", tmp_path)
+    run("faults.py", *scenarios, "--robots", "2", "--path", "12", "--speed", "4", "--results", tmp_path)
 
 
 @pytest.mark.attack

@@ -10,6 +10,7 @@ from evaluation.relation_closures import evaluate_closures
 from fcslam.cli import main
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.closures import ClosureScope
+from fcslam.lab.evaluation.relations import evaluate_relations
 from fcslam.metrics.relations import Relations
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, RobotTrajectory, Run
@@ -140,13 +141,16 @@ def test_a_false_relation_is_left_out_and_said(tmp_path, relations):
 @pytest.mark.system
 @pytest.mark.skipif("FCSLAM_DATA" not in os.environ, reason="FCSLAM_DATA is not set")
 def test_no_accepted_closure_of_a_real_fleet_is_wrong(tmp_path):
-    logs = Path(os.environ["FCSLAM_DATA"]) / "lidar" / "slam-benchmark"
-    assert main(["map", str(logs / "fr079.clf.xz"), "--split", "3", "--output", str(tmp_path / "run")]) == 0
-    report = evaluate_closures(tmp_path / "run", logs / "fr079.relations.gz")
+    """Nor is their map: the published bag of fr079 says that the laser sits ahead of the base; the log says behind."""
+    lidar, run = Path(os.environ["FCSLAM_DATA"]) / "lidar", tmp_path / "run"
+    assert main(["map", str(lidar / "rosbag1" / "fr079.sort.bag"), "--split", "3", "--output", str(run)]) == 0
+    reference = lidar / "slam-benchmark" / "fr079.relations.gz"
+    assert evaluate_relations(run, reference).translation.mean < 0.07
+    report = evaluate_closures(run, reference)
     assert report.relations.holds.all()
     for within in ClosureScope:
         score = report.scores[within, ACCEPTED]
         assert score.graph.wrong == score.single.wrong == 0
         assert score.graph.covered >= 0.8 * score.graph.closures
-        assert score.single.covered >= 20
+        assert score.single.covered >= 15
     assert report.scores[ClosureScope.FLEET, CANDIDATE].graph.wrong > 0  # so the reference can tell

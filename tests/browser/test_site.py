@@ -30,12 +30,16 @@ class Quiet(SimpleHTTPRequestHandler):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The address of the built site."""
-    folder = tmp_path_factory.mktemp("site")
-    subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(folder)],
-        cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, check=True, timeout=600,
-    )  # fmt: skip
+    """The address of the site: that of `make docs`, if it is as new as its sources."""
+    folder = ROOT / "site"
+    sources = (ROOT / "mkdocs.yml", *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/**/*.py"))
+    built = folder / "sitemap.xml"
+    if not built.exists() or built.stat().st_mtime < max(path.stat().st_mtime for path in sources):
+        folder = tmp_path_factory.mktemp("site")
+        subprocess.run(
+            [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(folder)],
+            cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, check=True, timeout=600,
+        )  # fmt: skip
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_address[1]}"

@@ -30,9 +30,9 @@ def fleet(tmp_path_factory):
     for robot, seeds in (("one", (1, 2, 3)), ("two", (4, 5)), ("bare", ())):
         (made / robot).mkdir()
         for seed in seeds:
-            cv2.imwrite(str(made / robot / f"{seed}.png"), textured(seed))
+            cv2.imwrite(str(made / robot / f"{seed}.png"), textured(seed, 128, 96))
     (made / "public").mkdir()
-    cv2.imwrite(str(made / "public" / "9.png"), textured(9))
+    cv2.imwrite(str(made / "public" / "9.png"), textured(9, 128, 96))
     (made / "tiny.yaml").write_text(yaml.safe_dump(TINY))
     return made
 

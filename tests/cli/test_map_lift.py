@@ -6,12 +6,13 @@ from fcslam.cli import main
 from fcslam.runs import open_run
 from tests.carmen_logs import write_carmen
 from tests.robot.lifting import ride
+from tests.robot.test_lifts import SHORT
 
 pytestmark = pytest.mark.slow
 
 
 def test_a_ride_in_a_lift_gives_two_maps_and_the_option_that_names_the_floor(tmp_path, capsys):
-    scans, _, (opening,) = ride(3, 4)
+    scans, _, (opening,) = ride(3, 4, laser=SHORT)
     write_carmen(tmp_path / "anna.clf", scans)
     assert main(["map", str(tmp_path / "anna.clf"), "--output", str(tmp_path / "run")]) == 0
     run, out = open_run(tmp_path / "run"), capsys.readouterr().out

@@ -69,17 +69,6 @@ def test_a_report_is_one_file_and_replaces_another_only_if_told(run, tmp_path, c
     assert "exists" in refused("show", run, "--html", tmp_path, "--force")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("option", ["--open", "--no-open"])
-def test_a_browser_opens_if_it_may(run, tmp_path, option):
-    browser, opened = tmp_path / "browser", tmp_path / "opened"
-    browser.write_text(f"#!/bin/sh\necho $1 > {opened}\n")
-    browser.chmod(0o755)
-    with Command("show", run, option, BROWSER=f"{browser} %s") as command:
-        assert command.get("/").status_code == 200
-        assert opened.exists() == (option == "--open")
-
-
 class Command:
     """A real one that shows a page."""
 
@@ -109,10 +98,16 @@ class Command:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_ends_the_page_with_success_also_while_somebody_looks(run, end):
-    with Command("show", run) as command:
+@pytest.mark.parametrize(("option", "end"), [("--open", signal.SIGINT), ("--no-open", signal.SIGTERM)])
+def test_a_browser_opens_if_it_may_and_ctrl_c_ends_the_page_with_success_also_while_somebody_looks(
+    run, tmp_path, option, end
+):
+    browser, opened = tmp_path / "browser", tmp_path / "opened"
+    browser.write_text(f"#!/bin/sh\necho $1 > {opened}\n")
+    browser.chmod(0o755)
+    with Command("show", run, option, BROWSER=f"{browser} %s") as command:
         assert "<canvas" in command.get("/").text
+        assert opened.exists() == (option == "--open")
         assert command.get(f"{API}/fleet").json()["read_only"]
         with httpx.stream("GET", f"{command.url}{API}/events", timeout=30.0) as events:
             assert events.status_code == 200

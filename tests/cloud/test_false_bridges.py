@@ -21,7 +21,7 @@ SEAM = 4e2 * np.eye(3)
 
 def building(seed, name, robots=2):
     """Packets of robots that drive through one building."""
-    fleet = small_fleet.draw(robots, 30.0, seed=seed).robots
+    fleet = small_fleet.draw(robots, 9.0, seed=seed).robots
     return {f"{name}_{robot.name}": sent(robot, f"{name}_{robot.name}") for robot in fleet}
 
 

@@ -64,7 +64,7 @@ def same(one, other):
 
 @pytest.mark.slow
 def test_restarts_anywhere_change_nothing(packets, uninterrupted, tmp_path):
-    cuts = np.sort(np.random.default_rng(0).integers(0, len(packets), 6))
+    cuts = np.sort(np.random.default_rng(0).integers(0, len(packets), 3))
     fleet = Fleet(CONFIG, 0)
     for begin, end in zip([0, *cuts], [*cuts, len(packets)], strict=True):
         fleet = restarted(go_on(fleet, packets[begin:end]), packets, tmp_path / "state")

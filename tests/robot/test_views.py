@@ -220,7 +220,7 @@ def test_corridors_that_repeat_themselves_join_nothing_by_their_images_alone():
     walls, count = corridor_of_one_pattern(8.0)
     config, cloud = RobotConfig(channels=(Channel.CAMERA,)), Cloud(FleetConfig(), 0)
     for number, start in enumerate((0.0, 24.0)):
-        records, _ = records_of([(start, 0.0), (start + 12.0, 0.0)], 10 + number, walls, lambda number: number // count)
+        records, _ = records_of([(start, 0.0), (start + 9.0, 0.0)], 10 + number, walls, lambda number: number // count)
         robot = RobotFrontend(f"r{number}", config)
         packets = [packet for record in records for packet in robot.process(record)] + robot.finish()
         assert any(isinstance(packet.body, Place) for packet in packets)

@@ -2,6 +2,7 @@
 
 import gzip
 import os
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.sources import Fault, open_source, split, write_bag
-from tests.sources.carmen_text import scans_of
+from tests.sources.carmen_text import only_scans, scans_of
 
 DATA = Path(os.environ.get("FCSLAM_DATA", "")) / "lidar"
 pytestmark = [
@@ -52,10 +53,11 @@ def test_published_bags_are_their_logs(bag):
 def test_a_log_and_its_bag_are_the_same_to_the_last_bit(tmp_path, log, name):
     """Also where the clock runs backwards (intel), and with odometry between the scans (fr079)."""
     source = open_source(DATA / f"slam-benchmark/{log}.clf.xz")
-    write_bag(tmp_path / name, source.records())
+    records = list(islice(source.records(), 3000))
+    write_bag(tmp_path / name, records)
     bag = open_source(tmp_path / name)
     assert bag.survey().lasers[0] == source.survey().lasers[0]
-    for before, after in zip(scans_of(source), scans_of(bag), strict=True):
+    for before, after in zip(only_scans(records), scans_of(bag), strict=True):
         assert after.stamp == before.stamp
         assert after.T_odom_base.tolist() == before.T_odom_base.tolist()
         beyond = before.ranges_m >= before.laser.max_range_m
@@ -63,15 +65,12 @@ def test_a_log_and_its_bag_are_the_same_to_the_last_bit(tmp_path, log, name):
     assert bag.faults[Fault.TIME_REVERSAL].count == source.faults[Fault.TIME_REVERSAL].count
 
 
-@pytest.mark.parametrize(("bag", "mean_m"), [("fr079", 0.07), ("mit-csail", 0.03)])
-def test_published_bags_map_well(tmp_path, capsys, bag, mean_m):
-    """The bag of fr079 says that the laser sits ahead of the base; the log says behind, and maps better."""
-    assert main(["map", str(DATA / f"rosbag1/{bag}.sort.bag"), "--output", str(tmp_path / "run")]) == 0
-    capsys.readouterr()
-    relations = DATA / f"slam-benchmark/{bag}.relations.gz"
+def test_a_published_bag_maps_well(tmp_path):
+    assert main(["map", str(DATA / "rosbag1/mit-csail.sort.bag"), "--output", str(tmp_path / "run")]) == 0
+    relations = DATA / "slam-benchmark/mit-csail.relations.gz"
     assert main(["evaluate", "relations", str(tmp_path / "run"), str(relations), "--csv", str(tmp_path / "e.csv")]) == 0
     rows = dict(line.split(",")[:2] for line in (tmp_path / "e.csv").read_text().splitlines())
-    assert float(rows["translation_error_mean"]) < mean_m
+    assert float(rows["translation_error_mean"]) < 0.03
 
 
 def test_intel_goes_back_in_time():
@@ -83,10 +82,8 @@ def test_intel_goes_back_in_time():
 
 
 @pytest.mark.parametrize("name", ["intel", "fr079", "mit-csail"])
-@pytest.mark.parametrize("parts", [1, 3])
-def test_every_relation_names_a_scan(name, parts):
-    source = open_source(DATA / f"slam-benchmark/{name}.clf.xz")
-    robots = [source] if parts == 1 else split(source, parts)
+def test_every_relation_names_a_scan(name):
+    robots = split(open_source(DATA / f"slam-benchmark/{name}.clf.xz"), 3)
     stamps = np.sort([scan.stamp for robot in robots for scan in scans_of(robot)])
     with gzip.open(DATA / f"slam-benchmark/{name}.relations.gz", "rt") as lines:
         named = np.array([line.split()[:2] for line in lines], dtype=np.float64).ravel()

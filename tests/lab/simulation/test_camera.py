@@ -52,8 +52,15 @@ def photographs(plan, decoration, poses, lighting=Lighting.DAY):
         return [camera.take(pose) for pose in poses]
 
 
-@pytest.mark.parametrize("target", [(2.5, 0.0, 0.6), (2.5, 0.6, 1.3), (3.5, -1.0, 0.4), (1.6, 0.5, 1.0)])
-@pytest.mark.parametrize("pose", [(3.0, 4.0, 0.0), (8.0, -2.0, 2.2), (-1.0, 0.5, -1.1)])
+@pytest.mark.parametrize(
+    ("target", "pose"),
+    [
+        ((2.5, 0.0, 0.6), (3.0, 4.0, 0.0)),
+        ((2.5, 0.6, 1.3), (8.0, -2.0, 2.2)),
+        ((3.5, -1.0, 0.4), (-1.0, 0.5, -1.1)),
+        ((1.6, 0.5, 1.0), (8.0, -2.0, 2.2)),
+    ],
+)
 def test_a_point_is_seen_where_the_intrinsics_and_the_mounting_say(flat, target, pose):
     """A small red plate in an empty place; ``target`` is its middle in the robot's base."""
     plan, decoration, _ = flat
