@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.sources.carmen_text import drive
+
 PACKAGE = Path(__file__).parents[1] / "src" / "fcslam"
 
 # From the ground up. A room may import itself and every room that stands before it.
@@ -163,6 +165,32 @@ def test_one_module_starts_processes():
         and {getattr(node, "module", None), *(alias.name for alias in node.names)} & starts
     }
     assert found == {"processes.py"}
+
+
+@pytest.mark.slow
+def test_a_log_is_mapped_without_bags_plans_servers_and_plots(tmp_path):
+    (tmp_path / "r.log").write_text("\n".join(drive(30, beams=180)))
+    program = [
+        "import sys, fcslam.cli",
+        "fcslam.cli.main(['map', 'r.log', '-o', 'run', '-q'])",
+        "print(*sys.modules)",
+    ]
+    loaded = set(printed(program, tmp_path).split())
+    assert {"fcslam.sources.logs.carmen", "fcslam.maps.drawing"} <= loaded
+    others = [
+        "asyncio",
+        "ssl",
+        "httpx",
+        "fastapi",
+        "matplotlib",
+        "pandas",
+        "onnxruntime",
+        "torch",
+        "psycopg",
+        "rosbags",
+    ]
+    unused = ["sources.bags.rosbag", "anchoring.plan", "anchoring.gnss", "wire.http_transport", "live.robot", "page"]
+    assert not loaded & {*others, *(f"fcslam.{module}" for module in unused)}
 
 
 @pytest.mark.slow

@@ -69,7 +69,12 @@ class UnavailableError(FcslamError):
 
 
 class StoreError(InputError):
-    """A mission cannot be stored or read: the disk is full, or the file is damaged or not a mission."""
+    """A mission cannot be stored or read: a full disk, a damaged file, a file that is no mission, a database away."""
+
+    def __init__(self, message: str, is_away: bool = False) -> None:
+        super().__init__(message)
+        self.is_away = is_away
+        """Whether it is a database, which may be back soon."""
 
 
 class PacketError(FcslamError):

@@ -86,7 +86,7 @@ def test_a_limit_that_is_not_one_is_told(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_an_instance_shows_no_password_and_ends_in_order(postgres, postgres_server, tmp_path):
+def test_an_instance_shows_no_password_survives_its_database_and_ends_in_order(postgres, postgres_server, tmp_path):
     for table in ("missions", "instances"):
         postgres.rows(f"DELETE FROM {table} RETURNING 1")
     port = free_port()
@@ -116,10 +116,17 @@ def test_an_instance_shows_no_password_and_ends_in_order(postgres, postgres_serv
             assert httpx.get(f"{address}/missions/other/api/v1/fleet").json()["mission"] == "other"
             assert httpx.get(f"{address}/api/v1/fleet").json()["mission"] == "other"
             assert httpx.get(f"{address}/missions/other/").status_code in (200, 404)
+            postgres_server.stop()
+            for method, path in (("GET", "fleet"), ("POST", "robots/a/packets"), ("POST", "finalize")):
+                away = httpx.request(method, f"{address}/api/v1/{path}", timeout=60.0)
+                assert away.status_code == 503, away.text
+                assert "cannot be used" in away.text
+            postgres_server.start()
         finally:
             served.send_signal(signal.SIGTERM)
             told, _ = served.communicate(timeout=60)
     assert served.returncode in (0, -signal.SIGTERM), told
     assert PASSWORD not in told
+    assert "Traceback" not in told
     assert postgres.rows("SELECT count(*) FROM instances") == [(0,)]
     assert postgres.rows("SELECT count(*) FROM missions WHERE expires > clock_timestamp()") == [(0,)]

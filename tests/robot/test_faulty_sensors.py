@@ -8,7 +8,7 @@ import pytest
 from fcslam.geometry import se2
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.mapped_scans import MappedScans
-from fcslam.sources.contradictions import FROZEN
+from fcslam.robot.wheel_odometry import FROZEN
 from tests import small_fleet
 
 FIRST, LAST = 60, 100

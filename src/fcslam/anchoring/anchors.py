@@ -8,16 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fcslam.anchoring.alignment import PlanAlignment, align_to_plan
-from fcslam.anchoring.gnss import Georeference, georeferenced
-from fcslam.anchoring.part import part_of, with_part
-from fcslam.anchoring.plan import BuildingPlan
-from fcslam.anchoring.plan_files import read_plan
-from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
-from fcslam.anchoring.surveyed_tags import MapTags, Survey, placed_by_tags, read_survey, tag_lines
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.errors import InputError, SourceError
 from fcslam.lidar.field import TOO_MANY_WALLS
+from fcslam.lidar.submap import Submap
 from fcslam.maps.changes import grown
 from fcslam.maps.drawing import highlighted_png
 from fcslam.maps.exports import outlines
@@ -25,7 +19,10 @@ from fcslam.maps.occupancy_map import GEOREFERENCE, Occupancy, OccupancyMap, map
 from fcslam.records import StrPath
 
 if TYPE_CHECKING:
-    from fcslam.anchoring.deviations import Comparison
+    from fcslam.anchoring.alignment import PlanAlignment
+    from fcslam.anchoring.gnss import Georeference
+    from fcslam.anchoring.plan import BuildingPlan
+    from fcslam.anchoring.surveyed_tags import Survey
 
 PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
 TAGS_JSON = "tags.json"
@@ -39,8 +36,8 @@ FuseMembers = Callable[[Sequence[MappedRobot]], OccupancyMap]
 class Anchors:
     """What is known about the building."""
 
-    plan: BuildingPlan | None = None
-    survey: Survey | None = None
+    plan: "BuildingPlan | None" = None
+    survey: "Survey | None" = None
     """Positions of tags."""
 
 
@@ -56,6 +53,12 @@ def read_anchors(plan: StrPath | None = None, plan_scale: float | None = None, t
         raise InputError(
             "--plan-scale (in Python plan_scale=) belongs to --plan; name the plan, or leave the scale out"
         )
+    if plan is None and tags is None:  # as most missions
+        return Anchors()
+    from fcslam.anchoring.plan import BuildingPlan
+    from fcslam.anchoring.plan_files import read_plan
+    from fcslam.anchoring.surveyed_tags import read_survey
+
     building = None if plan is None else BuildingPlan(read_plan(Path(plan), plan_scale))
     if building is not None and building.submap.field.is_full:
         raise SourceError(f"{plan}: {TOO_MANY_WALLS}; crop it")
@@ -76,6 +79,12 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
 
     Maps that a user ``placed`` stay about there. ``fuse`` draws a map.
     """
+    from fcslam.anchoring.alignment import align_to_plan
+    from fcslam.anchoring.gnss import georeferenced
+    from fcslam.anchoring.part import part_of, with_part
+    from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
+    from fcslam.anchoring.surveyed_tags import MapTags, placed_by_tags
+
     files: dict[str, bytes] = {}
     reports, pictures = [], []
     tags: list[dict[str, Any]] = []
@@ -91,10 +100,7 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
                 alignment = align_to_plan(anchors.plan, building, is_placed)
             if alignment is not None and not alignment.refusal:
                 part, scales = fit_to_plan(alignment.plan, part, alignment.T_plan_map)
-                from fcslam.anchoring.deviations import compare_with_plan  # few have a plan, and SciPy is large
-
-                compared = compare_with_plan(alignment.plan.submap, map_submap(part.robots))
-                reports.append(_plan_report(k, alignment, compared, scales))
+                reports.append(_plan_report(k, alignment, map_submap(part.robots), scales))
                 pictures.append(fuse(part.robots))
             else:
                 reason = "the map has no walls" if alignment is None else alignment.refusal
@@ -126,9 +132,10 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
     return Anchored(result, files)
 
 
-def _plan_report(
-    k: int, alignment: PlanAlignment, compared: "Comparison", scales: Mapping[str, float]
-) -> dict[str, object]:
+def _plan_report(k: int, alignment: "PlanAlignment", mapped: Submap, scales: Mapping[str, float]) -> dict[str, object]:
+    from fcslam.anchoring.deviations import compare_with_plan
+
+    compared = compare_with_plan(alignment.plan.submap, mapped)
     deviations = [
         {
             "kind": deviation.kind,
@@ -150,7 +157,7 @@ def _plan_report(
     }
 
 
-def _geo_report(found: Georeference) -> dict[str, object]:
+def _geo_report(found: "Georeference") -> dict[str, object]:
     if found.refusal:
         return {"georeferenced": False, "reason": found.refusal, "fixes": found.fixes, "ignored": found.ignored}
     return {
@@ -206,6 +213,8 @@ def anchoring_lines(files: Mapping[str, bytes]) -> Iterator[str]:
             f"{', '.join([*scales, f'{count} deviations of walls ({PLAN_JSON})'])}"
         )
     if TAGS_JSON in files:
+        from fcslam.anchoring.surveyed_tags import tag_lines
+
         yield from tag_lines(json.loads(files[TAGS_JSON]))
     for name, content in files.items():
         if name.endswith(GEOREFERENCE):

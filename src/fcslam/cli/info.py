@@ -67,15 +67,14 @@ def _calibration(recording: Path, options: "BagOptions | None") -> "Iterator[str
     from fcslam.cli.warm_up import compiled
     from fcslam.lidar.frontend import LidarConfig
     from fcslam.robot.calibrating import calibrate_bag
-    from fcslam.sources import open_source
-    from fcslam.sources.bags.rosbag import RosBag
+    from fcslam.sources.formats import bag_of, open_source
 
-    source = open_source(recording, options)
-    if not isinstance(source, RosBag):
+    bag = bag_of(open_source(recording, options))
+    if bag is None:
         yield "calibration: of ROS bags only"
         return
     with compiled(notices()):
-        found = calibrate_bag(source, LidarConfig())
+        found = calibrate_bag(bag, LidarConfig())
     estimated = found.calibration
     mounting = estimated.mounting or (None, None, None)
     yield "calibration from motion (standard deviation):"

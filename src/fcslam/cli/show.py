@@ -1,9 +1,7 @@
 """`fcslam show`: the page of `fcslam serve` on a finished run, or as one file."""
 
-import asyncio
 import os
 import sys
-import webbrowser
 from pathlib import Path
 from typing import Annotated
 
@@ -36,6 +34,9 @@ def show(
     force: Force = False,
 ) -> None:
     """Show a finished run in the browser, read-only; Ctrl-C ends it."""
+    import asyncio  # the other commands start without a server
+    import webbrowser
+
     from fcslam.page.report import ShownRun, report_html
     from fcslam.storage.files import write_file
 

@@ -4,11 +4,9 @@ The choice is a text: the number of processes, this one included, or the address
 tls://HOST:PORT. Of a cluster, those workers are used that compute, bit by bit, what this process computes.
 """
 
-import asyncio
 import hashlib
 import logging
 import re
-import ssl
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -201,7 +199,7 @@ class DaskCluster:
 
         try:  # TLS as Dask is configured (``distributed.comm.tls``)
             security = Security(require_encryption=self._address.startswith("tls://"))
-        except (OSError, ssl.SSLError, ValueError) as error:
+        except (OSError, ValueError) as error:
             raise InputError(f"{self._address}: the certificates cannot be used ({_text(error)})") from error
         self._client = Client(self._address, timeout=CONNECT_S, set_as_default=False, security=security, name="fcslam")
         self._client.loop.asyncio_loop.set_exception_handler(_note)
@@ -275,7 +273,7 @@ def _quiet() -> None:
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
-def _note(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+def _note(_loop: object, context: dict[str, Any]) -> None:
     """Log errors of connections that Dask gave up, which asyncio would print."""
     _log.debug("%s: %s", context["message"], context.get("exception"))
 

@@ -370,12 +370,11 @@ class MissionStore:
 
     def configure(self, config: CloudConfig) -> CloudConfig:
         """Store the mission's configuration, if it has none yet; returns the one that it has."""
-        text = config.model_dump_json()
-        with self._database.transaction() as database:
-            stored = database.execute("SELECT value FROM facts WHERE name = ?", (CONFIG,)).fetchone()
-            if stored is None:
-                _remember(database, CONFIG, text)
-        return config if stored is None else CloudConfig.model_validate_json(stored[0])
+        if self.fact(CONFIG) is None:  # else nothing is written: who only reads a mission changes nothing
+            with self._database.transaction() as database:
+                if not database.execute("SELECT 1 FROM facts WHERE name = ?", (CONFIG,)).fetchall():
+                    _remember(database, CONFIG, config.model_dump_json())
+        return CloudConfig.model_validate_json(self.fact(CONFIG) or "")
 
     def put_track(self, robot: str, epoch: int, track: Track) -> None:
         """Store the scans of a session, which a robot keeps to itself; known to the robot's own machine only."""

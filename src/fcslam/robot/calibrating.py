@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Final, TypeGuard
+from typing import TYPE_CHECKING, Final, TypeGuard
 
 import numpy as np
 
@@ -20,12 +21,16 @@ from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.predicted_motion import PREDICTED, MotionPrediction
 from fcslam.robot.wheel_odometry import is_jump
 from fcslam.sources.bags.options import BagCorrection
-from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.contradictions import RepeatedScans
+from fcslam.sources.faults import Faults
+from fcslam.sources.formats import bag_of
 from fcslam.sources.motion import OdometryUpdates
 from fcslam.sources.pose import pose_of
 from fcslam.sources.returns import FloorLine
-from fcslam.sources.source import Noted, Source
+from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
+
+if TYPE_CHECKING:
+    from fcslam.sources.bags.rosbag import RosBag
 
 MOST_JUMPS: Final = 10
 """Odometry that jumps more often is wrong."""
@@ -73,7 +78,7 @@ class Calibrated:
     """A sentence for each correction, with its standard deviation."""
 
 
-def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
+def calibrate_bag(bag: "RosBag", config: LidarConfig) -> Calibrated:
     """Estimate the timing and the mounting of the first laser of a bag with one laser."""
     contradictions = _contradictions(bag)
     floors = tuple(floor for _, floor in contradictions)
@@ -85,7 +90,7 @@ def calibrate_bag(bag: RosBag, config: LidarConfig) -> Calibrated:
     return replace(calibrated, correction=replace(calibrated.correction, floors=floors), lines=lines)
 
 
-def _calibrate_level(bag: RosBag, config: LidarConfig, facings: list[Contradiction | None]) -> Calibrated:
+def _calibrate_level(bag: "RosBag", config: LidarConfig, facings: list[Contradiction | None]) -> Calibrated:
     if len(facings) > 1:
         named = zip(bag.plan.lasers, facings, strict=True)
         lines = tuple(f"{laser.name}: {found}; not corrected" for laser, found in named if found)
@@ -113,7 +118,7 @@ def _calibrate_level(bag: RosBag, config: LidarConfig, facings: list[Contradicti
 
 def contradictions_of(source: Source) -> tuple[str, ...]:
     """Lines about the lasers of a recording of any format that contradict its odometry."""
-    say = str if isinstance(source, RosBag) else _without_tf
+    say = _without_tf if bag_of(source) is None else str
     lines = []
     for laser, (facing, floor) in zip(source.survey().lasers, _contradictions(source), strict=True):
         if facing is not None:
@@ -161,7 +166,7 @@ def _contradictions(source: Source) -> list[tuple[Contradiction | None, FloorLin
     return found
 
 
-def _calibrate_finely(bag: RosBag, config: LidarConfig) -> Calibrated:
+def _calibrate_finely(bag: "RosBag", config: LidarConfig) -> Calibrated:
     survey = bag.survey()
     assumed_s = survey.duration_s / max(1, survey.scan_count - 1)
     if len(survey.lasers) > 1 or not 0.0 < assumed_s < 1.0:
@@ -225,14 +230,41 @@ def _scale_line(name: str, scale: Estimate, remedy: str) -> str:
     return f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f}); {state}: {remedy}"
 
 
+class Noted:
+    """A recording with further notes in its survey."""
+
+    def __init__(self, source: Source, notes: tuple[str, ...]) -> None:
+        self.name = source.name
+        self._source = copy(source)
+        self._notes = notes
+
+    def __copy__(self) -> "Noted":
+        return Noted(self._source, self._notes)
+
+    @property
+    def faults(self) -> Faults:
+        """As in Source."""
+        return self._source.faults
+
+    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+        """As in Source."""
+        survey = self._source.survey(scans)
+        return replace(survey, notes=(*survey.notes, *self._notes))
+
+    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+        """As in Source."""
+        return self._source.records(scans)
+
+
 def calibrated(source: Source, config: LidarConfig) -> Source:
     """A recording with what its motion says against it; only a bag is corrected."""
-    if not isinstance(source, RosBag):
+    bag = bag_of(source)
+    if bag is None:
         said = contradictions_of(source)
         return Noted(source, tuple(f"{line}; not corrected" for line in said)) if said else source
-    found = calibrate_bag(source, config)
-    lines = tuple(f"{source.path}: {line}" for line in found.lines)
-    return source.corrected(found.correction, lines) if lines else source
+    found = calibrate_bag(bag, config)
+    lines = tuple(f"{bag.path}: {line}" for line in found.lines)
+    return bag.corrected(found.correction, lines) if lines else bag
 
 
 def _tracked(

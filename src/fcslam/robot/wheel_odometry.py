@@ -5,11 +5,15 @@ wheels that say nothing while the scans change are not used.
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from fcslam.geometry import se2
 from fcslam.lidar.first_motion import LONGEST_GAP_S
 from fcslam.lidar.odometry import WHEELS
 from fcslam.records import CameraImage, FloatArray, LaserScan, frozen
-from fcslam.sources.contradictions import WheelCheck
+from fcslam.sources.contradictions import CHANGED, changed_share, stands_still
+from fcslam.sources.faults import FEWEST
+from fcslam.sources.path_summary import PathSummary
 
 LEAST_BRIDGE_M, LEAST_BRIDGE_RAD = 0.02, 0.02
 """A bridge is at least such a motion: the tracker does not match the scans of a robot that stands still."""
@@ -20,6 +24,51 @@ LARGEST_SPEED_M_S, LARGEST_TURN_RAD_S = 5.0, 6.0
 """The fastest motion that wheel odometry may report between two scans; a faster one is a jump."""
 SLACK_M, SLACK_RAD = 1.0, 1.5
 """Length and turn allowed to any step besides, metres and radians, as stamps may be wrong."""
+SLIGHTLY_CHANGED = 0.1
+"""Share of the beams that measure something else, of a robot that moved on a little."""
+FROZEN = "stands still while the scans change"
+"""Fault of odometry that measured the motion before."""
+
+
+class WheelCheck:
+    """Finds odometry that says nothing, from the beginning on or any more, while the scans change."""
+
+    def __init__(self) -> None:
+        self.fault: str | None = None
+        """Why it is not odometry, as the end of a sentence; None if it can be."""
+        self.certain_s = -math.inf
+        """Stamp of the newest scan at which the odometry moved, or which measures what the scan at rest does."""
+        self._at_rest: LaserScan | None = None
+        """The first scan; once the odometry has said something, the first one where it now stands."""
+        self._path = PathSummary()
+        """Odometry until it says something."""
+        self._changed = 0
+        """Newest scans in a row that measure something else than the one at rest."""
+
+    @property
+    def may_be_frozen(self) -> bool:
+        """Whether odometry that measured the motion before stands still, and the newest scan has changed."""
+        return self._changed > 0 and self._path.says_something
+
+    def says_nothing(self, scan: LaserScan) -> bool:
+        """Whether the odometry up to the next scan says nothing while the scans change, or the first one has none."""
+        if self._at_rest is None:
+            self._at_rest = scan
+            return bool(np.isnan(scan.T_odom_base).any())
+        if not self._path.says_something:
+            x, y, theta = scan.T_odom_base.tolist()
+            self._path.add(scan.stamp, (x, y, theta))
+        if self._path.says_something and not stands_still(self._at_rest, scan):
+            self._at_rest, self._changed, self.certain_s = scan, 0, scan.stamp
+            return False
+        if scan.laser == self._at_rest.laser:
+            share = changed_share(self._at_rest.ranges_m, scan.ranges_m, scan.laser.max_range_m)
+            self._changed = self._changed + 1 if share > CHANGED else 0
+            if not share > SLIGHTLY_CHANGED:  # true for NaN
+                self.certain_s = scan.stamp
+        if self._changed >= FEWEST:
+            self.fault = FROZEN if self._path.says_something else self._path.fault
+        return self.fault is not None
 
 
 class WheelOdometry:

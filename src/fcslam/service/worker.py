@@ -562,22 +562,25 @@ def main() -> int:
         return 0
     folder = MissionFolder(Path(task.folder))
     look_s = math.inf if task.store is None else 0.25  # nobody notifies of packets that other instances stored
-    alone, mission = _alone(folder), _mission(folder, task)
-    with verifying(task.workers, must_connect=False) as verify_pairs, mission as (store, share):
-        try:
+    alone = _alone(folder)
+    try:
+        with (
+            verifying(task.workers, must_connect=False) as verify_pairs,
+            _mission(folder, task) as (store, share),
+        ):
             worker = Worker(folder, store, time.monotonic, emit_event, start_copy, verify_pairs, share)
             emit_event(READY, None)
             while True:
                 wait_s = 0.0 if worker.step() else min(worker.wait_s(), look_s)
                 if select.select([sys.stdin], [], [], wait_s)[0] and not os.read(sys.stdin.fileno(), 4096):
                     break
-        except LeaseLostError as error:
-            _log.warning("this worker ends: %s", error)
-        except BrokenPipeError:
-            _log.warning("this worker ends: its service is gone")
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to write goes nowhere
-        alone.close()
-        return 0
+    except (LeaseLostError, StoreError) as error:
+        _log.warning("this worker ends: %s", error)
+    except BrokenPipeError:
+        _log.warning("this worker ends: its service is gone")
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left to write goes nowhere
+    alone.close()
+    return 0
 
 
 def _task() -> WorkerTask | None:

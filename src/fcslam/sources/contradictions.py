@@ -12,9 +12,8 @@ from math import hypot, inf, remainder, tau
 import numpy as np
 
 from fcslam.records import LaserScan, Ranges
-from fcslam.sources.faults import FEWEST, Audit, Fault
+from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.motion import STILL_M, STILL_RAD
-from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import Pose
 
 CHANGE_M, CHANGE = 0.3, 0.05
@@ -23,10 +22,6 @@ CHANGED = 0.6
 """Share of the beams that measure something else, if the scan changed."""
 FEWEST_RETURNS = 20
 """Scans with fewer common returns are not compared."""
-SLIGHTLY_CHANGED = 0.1
-"""Share of the beams that measure something else, of a robot that moved on a little."""
-FROZEN = "stands still while the scans change"
-"""Fault of odometry that measured the motion before."""
 
 
 class RepeatedScans:
@@ -43,47 +38,6 @@ class RepeatedScans:
             return False
         self._newest[scan.laser.T_base_laser] = scan
         return True
-
-
-class WheelCheck:
-    """Finds odometry that says nothing, from the beginning on or any more, while the scans change."""
-
-    def __init__(self) -> None:
-        self.fault: str | None = None
-        """Why it is not odometry, as the end of a sentence; None if it can be."""
-        self.certain_s = -inf
-        """Stamp of the newest scan at which the odometry moved, or which measures what the scan at rest does."""
-        self._at_rest: LaserScan | None = None
-        """The first scan; once the odometry has said something, the first one where it now stands."""
-        self._path = PathSummary()
-        """Odometry until it says something."""
-        self._changed = 0
-        """Newest scans in a row that measure something else than the one at rest."""
-
-    @property
-    def may_be_frozen(self) -> bool:
-        """Whether odometry that measured the motion before stands still, and the newest scan has changed."""
-        return self._changed > 0 and self._path.says_something
-
-    def says_nothing(self, scan: LaserScan) -> bool:
-        """Whether the odometry up to the next scan says nothing while the scans change, or the first one has none."""
-        if self._at_rest is None:
-            self._at_rest = scan
-            return bool(np.isnan(scan.T_odom_base).any())
-        if not self._path.says_something:
-            x, y, theta = scan.T_odom_base.tolist()
-            self._path.add(scan.stamp, (x, y, theta))
-        if self._path.says_something and not stands_still(self._at_rest, scan):
-            self._at_rest, self._changed, self.certain_s = scan, 0, scan.stamp
-            return False
-        if scan.laser == self._at_rest.laser:
-            share = changed_share(self._at_rest.ranges_m, scan.ranges_m, scan.laser.max_range_m)
-            self._changed = self._changed + 1 if share > CHANGED else 0
-            if not share > SLIGHTLY_CHANGED:  # true for NaN
-                self.certain_s = scan.stamp
-        if self._changed >= FEWEST:
-            self.fault = FROZEN if self._path.says_something else self._path.fault
-        return self.fault is not None
 
 
 class ScanWatch:

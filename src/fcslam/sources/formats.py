@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,12 +13,14 @@ from fcslam.errors import SourceError
 from fcslam.records import LaserScan
 from fcslam.sources.bags.container import is_bag, parts_of
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_errors
 from fcslam.sources.logs.carmen import is_carmen
 from fcslam.sources.logs.carmen_log import CarmenLog
 from fcslam.sources.source import Source
 from fcslam.untrusted import open_file
+
+if TYPE_CHECKING:
+    from fcslam.sources.bags.rosbag import RosBag
 
 LOG, BAG = "CARMEN log", "ROS bag"
 _OTHERS: tuple[tuple[int, bytes, str], ...] = (
@@ -45,8 +48,18 @@ def open_fleet(
     sources: list[Source] = []
     for path, name in recordings:
         source = open_source(path, options, name) if isinstance(path, Path) else path
-        sources += source.robots(name) if isinstance(source, RosBag) and isinstance(path, Path) else [source]
+        bag = bag_of(source) if isinstance(path, Path) else None
+        sources += [source] if bag is None else bag.robots(name)
     return sources
+
+
+def bag_of(source: Source) -> "RosBag | None":
+    """A source that is a bag; None for any other. The readers of bags load with the first bag."""
+    if isinstance(source, CarmenLog):
+        return None
+    from fcslam.sources.bags.rosbag import RosBag
+
+    return source if isinstance(source, RosBag) else None
 
 
 def check_copies(sources: Sequence[Source]) -> None:
@@ -103,6 +116,8 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
                 "only, leave them out"
             )
         return CarmenLog(path, name or _robot_name(path))
+    from fcslam.sources.bags.rosbag import RosBag
+
     if robot is not None:
         options = replace(options or BagOptions(), robot=robot)
         name = name or robot.strip("/").replace("/", "_")

@@ -12,9 +12,8 @@ from fcslam.sources.bags.census import DecodedBag
 from fcslam.sources.bags.codec import SCANS
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.pairing import MAX_GAP_S
-from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.bags.transforms import Link
-from fcslam.sources.formats import format_of, open_source, robot_in
+from fcslam.sources.formats import bag_of, format_of, open_source, robot_in
 from fcslam.sources.source import Source
 
 GAP_INTERVALS = 5.0
@@ -97,13 +96,14 @@ def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
     """Read a recording once or twice and say what is in it."""
     source = open_source(path, options)
     name = format_of(robot_in(path)[0])
-    bag = _bag_contents(source.bag) if isinstance(source, RosBag) else None
+    bag = bag_of(source)
+    contents = None if bag is None else _bag_contents(bag.bag)
     try:
-        robots = source.robots() if isinstance(source, RosBag) else []
+        robots = [] if bag is None else bag.robots()
         if len(robots) < 2:
-            return _inspected(source, path, name, bag)
+            return _inspected(source, path, name, contents)
     except SourceError as error:
-        return Inspection(path, name, bag, problem=str(error))
+        return Inspection(path, name, contents, problem=str(error))
     found = []
     for robot in robots:
         place = Path(f"{path}:{robot.robot.name}")
@@ -111,7 +111,7 @@ def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
             found.append(_inspected(robot, place, name, None))
         except SourceError as error:
             found.append(Inspection(place, name, None, problem=str(error)))
-    return Inspection(path, name, bag, robots=tuple(found))
+    return Inspection(path, name, contents, robots=tuple(found))
 
 
 def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -> Inspection:
@@ -131,7 +131,8 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
                 odometry += 1
             case CameraImage():
                 images += 1
-    origin = source.plan.odometry if isinstance(source, RosBag) else None
+    of_bag = bag_of(source)
+    origin = None if of_bag is None else of_bag.plan.odometry
     return Inspection(
         path,
         name,

@@ -24,7 +24,7 @@ WHOLE = ScanRange()
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """Summary of a recording from one pass that does not parse the ranges."""
+    """Summary of a recording."""
 
     scan_count: int
     """Scans that ``records`` yields; it yields fewer only if the ranges of a scan are damaged."""
@@ -63,34 +63,9 @@ class Source(Protocol):
     def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
         """Stream scans, odometry and images in file order; other records belong to the scan before them.
 
-        Memory use does not depend on the recording's length. Every call starts a new pass. Raises as ``survey``.
+        A log is in memory as arrays meanwhile; of a bag, memory does not depend on its length. Every call starts a new
+        pass. Raises as ``survey``.
         """
-
-
-class Noted:
-    """A recording with further notes in its survey."""
-
-    def __init__(self, source: Source, notes: tuple[str, ...]) -> None:
-        self.name = source.name
-        self._source = copy(source)
-        self._notes = notes
-
-    def __copy__(self) -> "Noted":
-        return Noted(self._source, self._notes)
-
-    @property
-    def faults(self) -> Faults:
-        """As in Source."""
-        return self._source.faults
-
-    def survey(self, scans: ScanRange = WHOLE) -> Survey:
-        """As in Source."""
-        survey = self._source.survey(scans)
-        return replace(survey, notes=(*survey.notes, *self._notes))
-
-    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
-        """As in Source."""
-        return self._source.records(scans)
 
 
 def split(source: Source, parts: int) -> list[Source]:

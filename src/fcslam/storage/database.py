@@ -11,7 +11,7 @@ from typing import Any
 
 from fcslam.config import one_line
 from fcslam.errors import StoreError
-from fcslam.storage.row_store import RowStore, StoreTable
+from fcslam.storage.row_store import RowStore, StoreTable, all_rows
 from fcslam.untrusted import LimitError, open_database
 
 _BUSY_S = 30.0
@@ -26,6 +26,10 @@ class SealedConnection(sqlite3.Connection):
         marks = ", ".join(f"?{number}" for number in range(1, len(table.columns) + 1))
         verb = "INSERT OR REPLACE" if replaces else "INSERT"
         self.executemany(f"{verb} INTO {table.name} VALUES ({marks}, seal('{table.name}', {marks}))", rows)
+
+    def stream(self, table: StoreTable) -> Iterator[tuple[Any, ...]]:
+        """As in ``Transaction``."""
+        return self.execute(all_rows(table))
 
 
 class Database(RowStore):

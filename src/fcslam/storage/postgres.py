@@ -9,12 +9,13 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from urllib.parse import parse_qsl, unquote, urlencode, urlsplit, urlunsplit
 
 from fcslam.config import one_line
 from fcslam.errors import StoreError
-from fcslam.storage.row_store import StoreTable
+from fcslam.storage.row_store import StoreTable, all_rows
 
 if TYPE_CHECKING:
     import psycopg
@@ -24,7 +25,9 @@ if TYPE_CHECKING:
 RETRY_S: Final = 5.0
 """A server that is gone is looked for this long, before anything was changed."""
 ANSWER_S: Final = 10.0
-"""A statement that takes longer fails: the server, or the way to it, is gone."""
+"""A statement that takes longer fails: the server, or the way to it, is gone. A transaction may have many."""
+AT_ONCE: Final = 1000
+"""Rows that are sent or fetched at once."""
 LOOK_EVERY_S: Final = 1.0
 """How often connections in use are looked at."""
 MOST_CONNECTIONS: Final = 8
@@ -39,14 +42,14 @@ class Postgres:
             connection in the last moment of a transaction perhaps all of it.
     """
 
-    def __init__(self, url: str, name: str) -> None:
+    def __init__(self, url: str, name: str, answer_s: float = ANSWER_S, retry_s: float = RETRY_S) -> None:
         """Look for the server at a URL without a password (``take_password``); it shows ``name`` for this process."""
         self.url = _checked(url)
-        self._name = name
+        self._name, self._answer_s, self._retry_s = name, answer_s, retry_s
         self._idle: list[_Connection] = []
         self._places = threading.Semaphore(MOST_CONNECTIONS)
-        self._busy: dict[_Connection, float] = {}
-        """Since when each connection is in use."""
+        self.busy: dict[_Connection, float] = {}
+        """When the newest statement of each connection in use began."""
         self._closing = threading.Event()
         with self._translated():
             self._idle.append(self._connected())
@@ -74,18 +77,18 @@ class Postgres:
     def rows(self, statement: str, values: Sequence[object] = (), schema: str = "fcslam") -> list[tuple[Any, ...]]:
         """All rows that a query of a schema finds."""
         with self.connection(f"SET search_path TO {schema}") as connection:
-            found: list[tuple[Any, ...]] = PostgresTransaction(connection).execute(statement, values).fetchall()
+            found: list[tuple[Any, ...]] = PostgresTransaction(self, connection).execute(statement, values).fetchall()
         return found
 
     def _begun(self, begin: str) -> "_Connection":
         import psycopg
 
-        until = time.monotonic() + RETRY_S
+        until = time.monotonic() + self._retry_s
         while True:
             connection = None
             try:
                 connection = self._idle.pop() if self._idle else self._connected()
-                self._busy[connection] = time.monotonic()
+                self.busy[connection] = time.monotonic()
                 connection.execute(begin.encode())
                 return connection
             except BaseException as error:
@@ -105,14 +108,14 @@ class Postgres:
             autocommit=True,
             connect_timeout=3,
             application_name=f"fcslam {self._name}",
-            options=f"-c statement_timeout={ANSWER_S:.0f}s -c idle_in_transaction_session_timeout={RETRY_S:.0f}s "
-            "-c client_min_messages=error",
+            options=f"-c statement_timeout={1e3 * self._answer_s:.0f} -c client_min_messages=error"
+            f" -c idle_in_transaction_session_timeout={1e3 * self._retry_s:.0f}",
         )
 
     def _give_back(self, connection: "_Connection") -> None:
         from psycopg.pq import TransactionStatus
 
-        self._busy.pop(connection, None)
+        self.busy.pop(connection, None)
         if not connection.closed and connection.info.transaction_status is not TransactionStatus.IDLE:
             with suppress(Exception):  # it is closed then
                 connection.execute("ROLLBACK")
@@ -125,8 +128,8 @@ class Postgres:
         """Hang up on a server that does not answer: nothing else ends the wait for one that hangs."""
         while not self._closing.wait(LOOK_EVERY_S):
             now = time.monotonic()
-            for connection, since in list(self._busy.items()):
-                if now > since + ANSWER_S + RETRY_S:
+            for connection, since in list(self.busy.items()):
+                if now > since + self._answer_s + self._retry_s:
                     with suppress(Exception), socket.socket(fileno=os.dup(connection.fileno())) as line:
                         line.shutdown(socket.SHUT_RDWR)
 
@@ -139,17 +142,18 @@ class Postgres:
         except psycopg.Error as error:
             rights = isinstance(error, psycopg.errors.InsufficientPrivilege)
             advice = "; the role has too few rights: GRANT CREATE ON DATABASE, or name another role" if rights else ""
-            raise StoreError(f"{self.url}: cannot be used ({one_line(str(error))}){advice}") from error
+            raise StoreError(f"{self.url}: cannot be used ({one_line(str(error))}){advice}", not rights) from error
 
 
 class PostgresTransaction:
     """A transaction that is open."""
 
-    def __init__(self, connection: "_Connection") -> None:
-        self._connection = connection
+    def __init__(self, server: Postgres, connection: "_Connection") -> None:
+        self._server, self._connection = server, connection
 
     def execute(self, statement: str, values: Sequence[object] = ()) -> "psycopg.Cursor[tuple[Any, ...]]":
         """As in ``Transaction``."""
+        self._note()
         return self._connection.execute(statement.replace("?", "%s").encode(), _plain(values), binary=True)
 
     def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
@@ -159,16 +163,22 @@ class PostgresTransaction:
         if replaces:
             changes = ", ".join(f"{name} = excluded.{name}" for name in table.columns if name not in table.key)
             statement += f" ON CONFLICT ({', '.join(table.key)}) DO UPDATE SET {changes}"
+        plain = map(_plain, rows)
         with self._connection.cursor() as cursor:
-            cursor.executemany(statement, (_plain(row) for row in rows))
+            while some := list(islice(plain, AT_ONCE)):
+                self._note()
+                cursor.executemany(statement, some)
 
     def stream(self, table: StoreTable) -> Iterator[tuple[Any, ...]]:
-        """The rows of a table by its key, a few at a time."""
-        statement = f"SELECT {', '.join(table.columns)} FROM {table.name} ORDER BY {', '.join(table.key)}"
+        """As in ``Transaction``."""
         with self._connection.cursor(name="rows", binary=True) as cursor:
-            cursor.itersize = 1000
-            cursor.execute(statement)
-            yield from cursor
+            cursor.execute(all_rows(table))
+            while some := cursor.fetchmany(AT_ONCE):
+                self._note()
+                yield from some
+
+    def _note(self) -> None:
+        self._server.busy[self._connection] = time.monotonic()
 
 
 def take_password(url: str) -> str:

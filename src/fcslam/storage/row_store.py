@@ -6,7 +6,7 @@ Statements are written for both; marks are ``?``.
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -33,6 +33,14 @@ class Transaction(Protocol):
 
     def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
         """Insert rows, whose REAL values are floats; ``replaces``: in place of those with the same key."""
+
+    def stream(self, table: StoreTable) -> Iterator[tuple[Any, ...]]:
+        """The rows of a table by its key, a few at a time."""
+
+
+def all_rows(table: StoreTable) -> str:
+    """The query of all rows of a table, by its key."""
+    return f"SELECT {', '.join(table.columns)} FROM {table.name} ORDER BY {', '.join(table.key)}"
 
 
 def change_rows(

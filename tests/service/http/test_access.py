@@ -129,6 +129,7 @@ def test_who_has_the_right_is_not_turned_away(desk, routes, who):
         response = desk.ask(method, path.format(**VALUES), who)
         assert response.status_code not in (401, 403, 405), (method, path)
         assert response.status_code < 500, (method, path, response.text)
+        assert response.headers["cache-control"] in ("no-store", "private, no-cache"), (method, path)
 
 
 def test_without_tokens_nobody_is_asked_for_one(tmp_path, routes):

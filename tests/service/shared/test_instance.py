@@ -181,6 +181,31 @@ def test_an_instance_takes_no_more_missions_than_it_has_room_for(registry, postg
     small.close()
 
 
+def test_the_open_mission_has_a_worker_before_others(registry, postgres):
+    numbers = {name: wanted(registry, postgres, name) for name in ("old", "open", "new")}
+    registry.open(numbers["open"])
+    registry.leave()
+    one, _ = instance(postgres, "one", room=1)
+    one.step()
+    assert held(registry) == {"open": "one"}
+    registry.open(numbers["new"])
+    for _ in range(4):
+        one.step()
+        until(lambda: len(held(registry)) == 0 or "new" in held(registry))
+    assert held(registry) == {"new": "one"}, "another one makes room for it"
+    one.close()
+
+
+def test_who_only_reads_a_mission_wakes_it_not(registry, postgres):
+    store = MissionStore(MissionTables(postgres, wanted(registry, postgres, "old")))
+    postgres.rows("UPDATE missions SET is_wanted = false RETURNING 1")
+    store.configure(CloudConfig())
+    assert (store.envelopes(), store.applied(), store.edits(), store.refusals("a")) == ([], 0, [], [])
+    assert [mission.is_wanted for mission in registry.missions()] == [False]
+    store.put([packet()], 0.0)
+    assert [mission.is_wanted for mission in registry.missions()] == [True]
+
+
 def test_a_mission_in_which_nothing_happens_rests_until_its_next_packet(registry, postgres):
     number = wanted(registry, postgres, "quiet")
     one, workers = instance(postgres, "one")

@@ -2,17 +2,18 @@
 
 import sqlite3
 from contextlib import closing
+from functools import partial
 
 import numpy as np
 import pytest
 
 from fcslam.cloud.report import Track
 from fcslam.cloud.settings import CloudConfig
-from fcslam.errors import StoreError
-from fcslam.mission.mission_store import TABLES, MissionStore, StoredPacket, check_mission
+from fcslam.errors import InputError, StoreError
+from fcslam.mission.mission_store import FACTS, TABLES, MissionStore, StoredPacket, check_mission
 from fcslam.records import Removal, Veto, frozen
 from fcslam.service.shared.files import fetch_folder, fetched, put_file
-from fcslam.service.shared.mission_tables import LeaseLostError, MissionTables
+from fcslam.service.shared.mission_tables import LeaseLostError, MissionTables, insert_mission
 from fcslam.storage.postgres import Postgres
 from tests.mission.test_mission_store import correction, packet
 
@@ -61,11 +62,43 @@ def test_what_is_imported_is_exported_again(registry, postgres, tmp_path):
     fill(store)
     store.export(tmp_path / "before.sqlite")
     store.close()
-    tables = MissionTables(postgres, registry.create("imported"))
-    tables.import_mission(tmp_path / "before.sqlite")
+    tables = MissionTables(postgres, registry.create("imported", partial(insert_mission, tmp_path / "before.sqlite")))
     tables.export(tmp_path / "after.sqlite")
     assert rows(tmp_path / "after.sqlite") == rows(tmp_path / "before.sqlite")
     assert MissionStore(tables).put([packet(sequence=30)], 0.0) == 1
+
+
+def test_of_an_import_that_fails_nothing_remains(registry, postgres, tmp_path):
+    store = MissionStore(tmp_path / "mission.sqlite")
+    fill(store)
+    store.close()
+
+    def cut(transaction):
+        insert_mission(tmp_path / "mission.sqlite", transaction)
+        assert transaction.execute("SELECT count(*) FROM packets").fetchall() == [(32,)]
+        raise StoreError("the server is gone")
+
+    with pytest.raises(StoreError):
+        registry.create("half", cut)
+    assert [mission.name for mission in registry.missions()] == []
+    number = registry.create("half", partial(insert_mission, tmp_path / "mission.sqlite"))
+    assert len(MissionStore(MissionTables(postgres, number)).envelopes()) == 32
+    with pytest.raises(InputError, match="exists"):
+        registry.create("half", cut)
+
+
+def test_a_transaction_may_take_long_and_each_of_its_statements_not(registry, postgres):
+    """As the export and the import of a large mission."""
+    server = Postgres(postgres.url, "impatient", answer_s=0.5, retry_s=0.5)
+    tables = MissionTables(server, registry.create("long"))
+    with tables.transaction() as transaction:
+        for k in range(10):
+            transaction.insert(FACTS, [(f"fact {k}", "x")])
+            transaction.execute("SELECT pg_sleep(0.3)")
+    assert len(tables.rows("SELECT name FROM facts")) == 10
+    with pytest.raises(StoreError, match="statement timeout"):
+        tables.rows("SELECT pg_sleep(60)")
+    server.close()
 
 
 def test_a_worker_that_lost_its_lease_writes_nothing(registry, postgres, tmp_path):

@@ -122,7 +122,7 @@ def fleet_router(state: ViewerState) -> APIRouter:
             raise
         except InputError as error:
             raise HTTPException(404, str(error)) from error
-        return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=60"})
+        return Response(picture, media_type="image/png")
 
     @router.get(_CLOSURE, responses=refusals(400, 404))
     def get_closure(closure: Annotated[ClosureRow, Depends(closure_of)]) -> ClosureSummary:

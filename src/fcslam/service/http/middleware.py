@@ -8,7 +8,7 @@ from socket import gethostname
 from typing import Final
 from urllib.parse import urlsplit
 
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from fcslam.records import NAME
@@ -86,7 +86,7 @@ def named_missions(app: ASGIApp, named: ContextVar[str | None]) -> ASGIApp:
 
 
 def watched(app: ASGIApp, state: ServiceState) -> ASGIApp:
-    """Count answers that refuse, and write the audit log.
+    """Count answers that refuse, write the audit log, and let nobody keep answers that do not allow it.
 
     Plain ASGI: a middleware of Starlette's own base runs a task for every request.
     """
@@ -107,6 +107,7 @@ def watched(app: ASGIApp, state: ServiceState) -> ASGIApp:
         async def noting(message: Message) -> None:
             if message["type"] == "http.response.start":
                 note(scope, message["status"])
+                MutableHeaders(scope=message).setdefault("Cache-Control", "no-store")  # all but the page is data
             await send(message)
 
         await app(scope, receive, noting)

@@ -50,7 +50,8 @@ def add_handlers(app: FastAPI) -> None:
 
 
 def _on_fcslam_error(_: Request, error: Exception) -> JSONResponse:
-    status = next((STATUS[kind] for kind in type(error).mro() if kind in STATUS), 500)
+    is_away = isinstance(error, StoreError) and error.is_away
+    status = 503 if is_away else next((STATUS[kind] for kind in type(error).mro() if kind in STATUS), 500)
     headers = {"Retry-After": str(math.ceil(error.retry_after_s))} if isinstance(error, BusyError) else None
     index = getattr(error, "index", None)
     return problem(status, str(error), headers, **({} if index is None else {"index": index}))

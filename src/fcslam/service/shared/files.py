@@ -31,7 +31,7 @@ def put_file(server: Postgres, lease: Lease, name: str, path: Path) -> None:
         content = _packed(path) if path.is_dir() else path.read_bytes()
     # Without the lock of those who store packets: this may take a while.
     with server.connection(f"BEGIN; SET LOCAL search_path TO {schema_of(lease.mission)}") as connection:
-        transaction = PostgresTransaction(connection)
+        transaction = PostgresTransaction(server, connection)
         check_lease(transaction, lease)
         transaction.execute(
             "INSERT INTO files VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET content = excluded.content",

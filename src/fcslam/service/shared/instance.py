@@ -134,14 +134,16 @@ class Instance:
     def _spread(self) -> None:
         """Take missions without a worker, or give one up, until each instance has its part."""
         wanted = [mission for mission in self.known.values() if mission.is_wanted]
-        part = fair_part(len(wanted), self._registry.rooms(), self._most)
-        is_any_free = any(not mission.is_held for mission in wanted)
-        may_claim = self._clock() >= self._claims_from
-        if is_any_free and may_claim and len(self._held) < part:
-            for lease in self._registry.claim(part - len(self._held)):
+        free = [mission for mission in wanted if not mission.is_held]
+        rooms = self._registry.rooms()
+        surplus = len(self._held) - fair_part(len(wanted), rooms, self._most)
+        if surplus == 0 and sum(rooms) < len(wanted) and any(mission.is_open for mission in free):
+            free, surplus = [], 1  # robots send to the open mission, so another one makes room
+        if free and self._clock() >= self._claims_from and surplus < 0:
+            for lease in self._registry.claim(-surplus):
                 mission = next(mission for mission in self._registry.missions() if mission.number == lease.mission)
                 self._held[lease] = self._launch(mission, lease)
-        elif not is_any_free and not self._ending and len(self._held) > part:
+        elif not free and not self._ending and self._held and surplus > 0:
             self._end(next(reversed(self._held)))
 
     def _end(self, lease: Lease) -> None:

@@ -15,7 +15,7 @@ from fcslam.mission.mission_store import SCHEMA, TABLES
 from fcslam.mission.mission_store import VERSION as FILE_VERSION
 from fcslam.storage.database import Database, translate_errors
 from fcslam.storage.postgres import Postgres, PostgresTransaction
-from fcslam.storage.row_store import RowStore
+from fcslam.storage.row_store import RowStore, Transaction
 
 VERSION: Final = 2
 """Version of the tables."""
@@ -119,7 +119,7 @@ class MissionTables(RowStore):
             LeaseLostError: another worker has the mission.
         """
         with self._server.connection(self._begin) as connection:
-            transaction = PostgresTransaction(connection)
+            transaction = PostgresTransaction(self._server, connection)
             if self._lease is not None:
                 check_lease(transaction, self._lease)
             yield transaction
@@ -134,37 +134,33 @@ class MissionTables(RowStore):
         """All rows that a query finds."""
         return self._server.rows(statement, values, self._schema)
 
-    @contextmanager
-    def _snapshot(self) -> Iterator[PostgresTransaction]:
-        """Read several tables as they are at one moment."""
-        begin = f"BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY; SET LOCAL search_path TO {self._schema}"
-        with self._server.connection(begin) as connection:
-            yield PostgresTransaction(connection)
-            connection.execute("COMMIT")
-
-    def import_mission(self, path: Path) -> None:
-        """Insert the rows of a mission file into a mission that has none."""
-        with closing(Database(path, SCHEMA, FILE_VERSION)) as file, self.transaction() as transaction:
-            for table in TABLES:
-                columns, key = ", ".join(table.columns), ", ".join(table.key)
-                rows = file.rows(f"SELECT {columns} FROM {table.name} ORDER BY {key}")
-                transaction.insert(table, rows)
-
     def export(self, path: Path) -> None:
         """As in ``RowStore``."""
         rows = path.with_name(f".{path.name}.rows")
         with translate_errors(path):
             rows.unlink(missing_ok=True)
+        begin = f"BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY; SET LOCAL search_path TO {self._schema}"
         try:
             with closing(Database(rows, SCHEMA, FILE_VERSION)) as file:
-                with self._snapshot() as found, file.transaction() as transaction:
-                    for table in TABLES:
-                        transaction.insert(table, found.stream(table))
+                # The file is committed without the connection, which may not rest for so long.
+                with file.transaction() as written, self._server.connection(begin) as connection:
+                    _copy(PostgresTransaction(self._server, connection), written)
                 file.export(path)
         finally:
             for left in path.parent.glob(f"{rows.name}*"):
                 with suppress(OSError):
                     left.unlink()
+
+
+def insert_mission(path: Path, transaction: Transaction) -> None:
+    """Insert the rows of a mission file that ``check_mission`` passed."""
+    with closing(Database(path, SCHEMA, FILE_VERSION, is_checked=True)) as file, file.transaction() as rows:
+        _copy(rows, transaction)
+
+
+def _copy(rows: Transaction, into: Transaction) -> None:
+    for table in TABLES:
+        into.insert(table, rows.stream(table))
 
 
 def check_lease(transaction: PostgresTransaction, lease: Lease) -> None:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +19,7 @@ from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, locked, sweep
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SharedDetectors, fetch_folder, fetched
 from fcslam.service.shared.instance import Instance
-from fcslam.service.shared.mission_tables import Lease, MissionTables, schema_of
+from fcslam.service.shared.mission_tables import Lease, MissionTables, insert_mission, schema_of
 from fcslam.service.shared.registry import KnownMission, Registry
 from fcslam.service.supervisor import Elsewhere, RunningWorker
 from fcslam.service.viewed_mission import PacketCounts
@@ -233,7 +234,7 @@ class SharedMissions:
     def import_mission(self, name: str, path: Path) -> None:
         """As in ``Missions``."""
         check_name(name, "mission")
-        MissionTables(self._server, self._registry.create(name)).import_mission(path)
+        self._registry.create(name, partial(insert_mission, path))
         self._instance.look()
 
     def close(self) -> None:

@@ -3,12 +3,12 @@
 All times are of the server's clock, so a wrong clock of an instance does no harm.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 from fcslam.errors import InputError
 from fcslam.service.shared.mission_tables import Lease, mission_statements
-from fcslam.storage.postgres import Postgres
+from fcslam.storage.postgres import Postgres, PostgresTransaction
 
 LEASE_S: Final = 3.0
 """An instance that does not renew its leases for so long loses them."""
@@ -75,18 +75,31 @@ class Registry:
         """All missions, by name."""
         return [KnownMission(*row) for row in self._server.rows(_READ)]
 
-    def create(self, name: str) -> int:
-        """Create a mission without a row in its tables; returns its number. It needs no worker before its first row."""
+    def create(self, name: str, fill: Callable[[PostgresTransaction], None] | None = None) -> int:
+        """Create a mission; returns its number. ``fill`` inserts its rows; if it fails, there is no mission.
+
+        A mission without a row in its tables needs no worker.
+        """
+        exists = InputError(f"mission '{name}' exists; open it or choose another name")
         with self._server.connection("BEGIN; SET LOCAL search_path TO fcslam") as connection:
-            new = connection.execute(
-                "INSERT INTO missions (name) VALUES (%s) ON CONFLICT DO NOTHING RETURNING number", (name,)
-            ).fetchone()
-            if new is None:
-                raise InputError(f"mission '{name}' exists; open it or choose another name")
-            number = int(new[0])
+            transaction = PostgresTransaction(self._server, connection)
+            if transaction.execute("SELECT 1 FROM missions WHERE name = ?", (name,)).fetchall():
+                raise exists
+            counter = "SELECT nextval(pg_get_serial_sequence('missions', 'number'))"
+            ((number,),) = transaction.execute(counter).fetchall()
             connection.execute(mission_statements(number))
+            if fill is not None:
+                fill(transaction)
+            # Only now, as whoever opens a mission waits for this row.
+            new = transaction.execute(
+                "INSERT INTO fcslam.missions (number, name, is_wanted) OVERRIDING SYSTEM VALUE VALUES (?, ?, ?)"
+                " ON CONFLICT DO NOTHING RETURNING 1",
+                (number, name, fill is not None),
+            )
+            if not new.fetchall():
+                raise exists
             connection.execute("COMMIT")
-        return number
+        return int(number)
 
     def open(self, number: int) -> None:
         """Let robots that name no mission send to this one."""
@@ -100,11 +113,15 @@ class Registry:
             connection.execute("COMMIT")
 
     def claim(self, most: int) -> list[Lease]:
-        """Take up to ``most`` missions that need a worker and have none, each with a new fencing number."""
+        """Take up to ``most`` missions that need a worker and have none, each with a new fencing number.
+
+        The open mission comes first, then those in which something happened last.
+        """
         claimed = self._server.rows(
             "UPDATE missions SET holder = ?, fence = fence + 1, is_ready = false, touched = clock_timestamp(),"
             f" expires = {self._expiry} WHERE number IN (SELECT number FROM missions"
-            " WHERE is_wanted AND expires < clock_timestamp() ORDER BY number LIMIT ? FOR UPDATE SKIP LOCKED)"
+            " WHERE is_wanted AND expires < clock_timestamp() ORDER BY is_open DESC, touched DESC LIMIT ?"
+            " FOR UPDATE SKIP LOCKED)"
             " RETURNING number, fence",
             (self._instance, most),
         )

@@ -16,15 +16,20 @@ TRUEPOS ...) are passed over; a line that starts with no message name is broken.
 """
 
 import re
-from collections.abc import Callable
+from array import array
+from collections.abc import Sequence
+from itertools import pairwise
 from math import isfinite, nan
-from typing import NamedTuple
+from pathlib import Path
 
 import numpy as np
 
+from fcslam.compiled import njit
 from fcslam.geometry.beams import is_field_of_view
-from fcslam.records import Beams, LaserModel, Ranges, frozen
+from fcslam.records import Beams, FloatArray, LaserModel, Ranges, frozen
+from fcslam.sources.logs.archive import head, numbered_lines, translate_errors
 from fcslam.sources.pose import LARGEST_COORDINATE, Pose
+from fcslam.untrusted import check_unpacked
 
 SICK_MAX_RANGE_M = 50.0
 """SICK scanners send it, or more, for no return."""
@@ -41,30 +46,13 @@ _KNOWN = re.compile(
     rb"^[ \t]*(#.*CARMEN|(PARAM|SYNC|ODOM|[FR]LASER|RAWLASER\d|ROBOTLASER\d|NEFF|TRUEPOS)\s)", re.MULTILINE
 )
 
-
-class ScanLine(NamedTuple):
-    """One scan."""
-
-    stamp: float
-    """Seconds; NaN if the log states none."""
-    T_odom_base: Pose
-    T_odom_laser: Pose
-    ranges_m: Ranges
-    """Those that are negative, not finite or too large are NaN."""
-    stated: LaserModel | None = None
-    """The laser that the line states, without its mounting."""
-    is_timed: bool = True
-    """False once a stamp stands where the log states none."""
-
-
-class OdometryLine(NamedTuple):
-    """One reading of the odometry."""
-
-    stamp: float
-    T_odom_base: Pose
-
-
-Line = ScanLine | OdometryLine
+BROKEN = -(2**63)
+"""Stands for a line that cannot be read."""
+UNTIMED_STEP_S = 1.0
+"""Time between the scans of a log that states none."""
+_DIGITS = 15
+"""Numbers of so many digits and their power of ten are exact in double precision: their ratio is rounded once."""
+_POWERS = 10.0 ** np.arange(_DIGITS + 1)
 
 
 def is_carmen(head: bytes) -> bool:
@@ -72,88 +60,168 @@ def is_carmen(head: bytes) -> bool:
     return bool(_KNOWN.search(head))
 
 
-def is_raw(head: bytes) -> bool:
-    """Whether the log has raw scans only."""
-    return bool(_RAW.search(head) and not _SCAN.search(head))
+class CarmenArrays:
+    """The content of a log. Scans and readings of the odometry are counted from 0, each for themselves."""
 
-
-class CarmenParser:
-    """Parses the lines of one pass over a log; holds the latest odometry and the settings of the robot."""
-
-    def __init__(self, raw: bool) -> None:
-        """``raw``: scans are RAWLASER1 only."""
+    def __init__(self, path: Path) -> None:
+        """Read the log."""
+        self.numbers, self.contents = array("q"), array("q")
+        """Numbers, from 1, of the lines that are used, and what each holds: k is scan k, ``~k`` is reading k."""
+        self.stamps, self.odometry_stamps = array("d"), array("d")
+        """Of the scans and the readings, seconds."""
+        self.untimed = set[int]()
+        """Scans whose stamps the log does not state."""
+        self.stated: list[LaserModel | None] = []
+        """The laser that the line of each scan states, without its mounting."""
         self.parameters: dict[str, str] = {}
-        self._T_odom_base: Pose | None = None
-        self._parsers: dict[bytes, Callable[[bytes], Line | None]] = {
-            **(
-                {b"RAWLASER1": self._rawlaser} if raw else {b"FLASER": _parse_flaser, b"ROBOTLASER1": _parse_robotlaser}
-            ),
-            b"ODOM": self._odometry,
-            b"PARAM": self._parameter,
-        }
+        """Settings of the robot."""
+        self._poses, self._odometry, self._ranges_m, self._ends = array("d"), array("d"), array("f"), [0]
+        beginning = head(path)
+        is_raw = bool(_RAW.search(beginning) and not _SCAN.search(beginning))  # scans are RAWLASER1 only
+        scans = (
+            {b"RAWLASER1": self._rawlaser} if is_raw else {b"FLASER": self._flaser, b"ROBOTLASER1": self._robotlaser}
+        )
+        parsers = {**scans, b"ODOM": self._odom, b"PARAM": self._parameter}
+        with translate_errors(path):
+            size = path.stat().st_size
+            for number, line in numbered_lines(path):
+                try:
+                    message = _MESSAGE.match(line)
+                    if message is None:
+                        raise ValueError("no CARMEN message")
+                    parse = parsers.get(message[1])
+                    content = parse(line.replace(b",", b".")) if parse else None  # some languages write decimal commas
+                except ValueError:
+                    content = BROKEN
+                if content is not None:
+                    self.numbers.append(number)
+                    self.contents.append(content)
+                check_unpacked(size, 4 * len(self._ranges_m) + 16 * len(self.numbers))
+        poses: FloatArray = frozen(np.frombuffer(self._poses).reshape(-1, 6))
+        self.T_odom_laser, self.T_odom_base = poses[:, :3], poses[:, 3:]
+        """Of the scans, shape (S, 3)."""
+        self.odometry: FloatArray = frozen(np.frombuffer(self._odometry).reshape(-1, 3))
+        """T_odom_base of the readings, shape (R, 3)."""
+        ranges_m: Ranges = frozen(np.frombuffer(self._ranges_m, np.float32), np.float32)
+        self.ranges_m = [ranges_m[begin:end] for begin, end in pairwise(self._ends)]
+        """Of each scan; those that are negative, not finite or too large are NaN."""
 
-    def __call__(self, line: bytes) -> Line | None:
-        """The message of a line; None if it is not used. Raises ValueError for a broken line."""
-        message = _MESSAGE.match(line)
-        if message is None:
-            raise ValueError("no CARMEN message")
-        parser = self._parsers.get(message[1])
-        return parser(line.replace(b",", b".")) if parser else None  # some languages write decimal commas
+    def beams_of(self, scan: int, declared: Beams) -> Beams | None:
+        """The beams that a scan states, or those of the laser; None if there are more or fewer and no angles."""
+        stated = self.stated[scan]
+        if stated is not None:
+            return stated.beams
+        return declared if len(self.ranges_m[scan]) == declared.beam_count else None
 
-    def _rawlaser(self, line: bytes) -> ScanLine:
+    def _flaser(self, line: bytes) -> int:
+        front, *tail = line.rsplit(None, 9)
+        _, count, *text = front.split(None, 2)
+        values, rest = _numbers(b"".join(text), int(count))
+        if len(values) and not rest.strip():
+            return self._scan(_stamp_of(tail[6]), tail[:6], values)
+        front, *tail = line.rsplit(None, 6)
+        _, _, *text = front.split(None, 2)
+        values, rest = _numbers(b"".join(text), int(count))
+        if rest.strip():
+            raise ValueError("not as many ranges as stated")
+        return self._scan(None, tail, values)
+
+    def _robotlaser(self, line: bytes) -> int:
+        front, *tail = line.rsplit(None, 14)
+        measured = _measured(front)  # refuses what is too short
+        return self._scan(_stamp_of(tail[11]), tail[:6], *measured)
+
+    def _rawlaser(self, line: bytes) -> int:
         front, *tail = line.rsplit(None, 3)
         measured = _measured(front)
-        if self._T_odom_base is None:
+        if not self._odometry:
             raise ValueError("no odometry before the scan")
-        return ScanLine(_stamp_of(tail[0]), self._T_odom_base, self._T_odom_base, *measured)
+        return self._scan(_stamp_of(tail[0]), 2 * self._odometry[-3:].tolist(), *measured)
 
-    def _odometry(self, line: bytes) -> OdometryLine:
+    def _scan(
+        self,
+        stamp: float | None,
+        poses: Sequence[bytes | float],
+        ranges_m: FloatArray,
+        stated: LaserModel | None = None,
+    ) -> int:
+        """Add a scan; the log states no ``stamp`` if it is None."""
+        if len(ranges_m) == 0:
+            raise ValueError("not as many ranges as stated")
+        if not (ranges_m.min() >= 0.0 and ranges_m.max() < _LONGEST_RANGE_M):
+            is_range = (ranges_m >= 0.0) & np.isfinite(ranges_m)
+            ranges_m = np.where(is_range, np.minimum(ranges_m, _LONGEST_RANGE_M), nan)
+        self._poses.extend(_pose_of(poses[:3]) + _pose_of(poses[3:]))
+        self._ranges_m.frombytes(ranges_m.astype(np.float32).tobytes())
+        self._ends.append(len(self._ranges_m))
+        self.stated.append(stated)
+        self.stamps.append(len(self.untimed) * UNTIMED_STEP_S if stamp is None else stamp)
+        scan = len(self.stamps) - 1
+        if stamp is None:
+            self.untimed.add(scan)
+        return scan
+
+    def _odom(self, line: bytes) -> int:
         words = line.split()
         if len(words) < 7:
             raise ValueError("too few words")
-        self._T_odom_base = _pose_of(words[1:4])
-        return OdometryLine(_stamp_of(words[7]) if len(words) >= 10 else nan, self._T_odom_base)
+        pose, is_timed = _pose_of(words[1:4]), len(words) >= 10
+        self.odometry_stamps.append(_stamp_of(words[7]) if is_timed else len(self.untimed) * UNTIMED_STEP_S)
+        self._odometry.extend(pose)
+        return -len(self.odometry_stamps)
 
     def _parameter(self, line: bytes) -> None:
         _, name, value, *_ = line.decode("ascii", errors="replace").split()
         self.parameters[name] = value
 
 
-def _parse_flaser(line: bytes) -> ScanLine:
-    front, *tail = line.rsplit(None, 9)
-    _, count, *words = front.split()
-    is_timed = len(words) == int(count)
-    if not is_timed:
-        front, *tail = line.rsplit(None, 6)
-        _, _, *words = front.split()
-    stamp = _stamp_of(tail[6]) if is_timed else nan
-    return ScanLine(stamp, _pose_of(tail[3:6]), _pose_of(tail[:3]), _ranges_of(words, int(count)))
-
-
-def _parse_robotlaser(line: bytes) -> ScanLine:
-    front, *tail = line.rsplit(None, 14)
-    measured = _measured(front)
-    return ScanLine(_stamp_of(tail[11]), _pose_of(tail[3:6]), _pose_of(tail[:3]), *measured)
-
-
-def _measured(front: bytes) -> tuple[Ranges, LaserModel]:
+def _measured(front: bytes) -> tuple[FloatArray, LaserModel]:
     """Ranges and laser in a line up to its remissions."""
-    _, kind, start, fov, resolution, max_range, _, _, count, *words = front.split()
-    beam_count = int(count)
-    if not 0 < beam_count < len(words) or len(words) != beam_count + 1 + int(words[beam_count]):
-        raise ValueError("not as many ranges and remissions as stated")
-    ranges_m = _ranges_of(words[:beam_count], beam_count)
+    _, kind, start, fov, resolution, max_range, _, _, count, text = front.split(None, 9)
+    values, rest = _numbers(text, int(count))
+    remission_count, *remissions = rest.split()
+    if len(remissions) != int(remission_count):
+        raise ValueError("not as many remissions as stated")
     numbers = [float(token) for token in (start, fov, resolution, max_range)]
-    return ranges_m, _stated_laser(int(kind), numbers, beam_count)
+    return values, _stated_laser(int(kind), numbers, len(values))
 
 
-def _ranges_of(words: list[bytes], beam_count: int) -> Ranges:
-    if beam_count < 2 or len(words) != beam_count:
-        raise ValueError("not as many ranges as stated")
-    values = np.array(words, dtype=np.float64)
-    if not (values.min() >= 0.0 and values.max() < _LONGEST_RANGE_M):
-        values = np.where((values >= 0.0) & np.isfinite(values), np.minimum(values, _LONGEST_RANGE_M), nan)
-    return frozen(values, np.float32)
+def _numbers(text: bytes, count: int) -> tuple[FloatArray, bytes]:
+    """The first ``count`` numbers of a text, and what follows them; none if it has fewer."""
+    if not 2 <= count <= len(text):
+        return np.zeros(0), text
+    values = np.empty(count)
+    end = _plain_numbers(np.frombuffer(text, np.uint8), values)
+    if end >= 0:
+        return values, text[end:]
+    words = text.split(None, count)
+    if len(words) < count:
+        return np.zeros(0), text
+    return np.array(words[:count], np.float64), b"".join(words[count:])
+
+
+@njit(allocates=False)
+def _plain_numbers(text, values):  # type: ignore[no-untyped-def]
+    """Read numbers of digits and a point, separated by white space; returns where they end, -1 if one is not plain."""
+    at = 0
+    for k in range(len(values)):
+        while at < len(text) and (text[at] == 32 or 9 <= text[at] <= 13):
+            at += 1
+        number, digits, decimals, is_decimal = 0, 0, 0, False
+        while at < len(text) and not (text[at] == 32 or 9 <= text[at] <= 13):
+            if text[at] == 46 and not is_decimal:
+                is_decimal = True
+            elif 48 <= text[at] <= 57:
+                number = 10 * number + (text[at] - 48)
+                digits += 1
+                decimals += is_decimal
+            else:
+                return -1
+            at += 1
+        if not 0 < digits <= _DIGITS:
+            return -1
+        values[k] = number / _POWERS[decimals]
+    return at
 
 
 def _stated_laser(kind: int, numbers: list[float], beam_count: int) -> LaserModel:
@@ -168,7 +236,7 @@ def _stated_laser(kind: int, numbers: list[float], beam_count: int) -> LaserMode
     return LaserModel(beam_count, start_rad, increment_rad, max_range_m)
 
 
-def _pose_of(tokens: list[bytes]) -> Pose:
+def _pose_of(tokens: Sequence[bytes | float]) -> Pose:
     """Raises ValueError for an implausible pose."""
     x, y, theta = map(float, tokens)
     limit = LARGEST_COORDINATE

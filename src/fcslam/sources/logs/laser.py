@@ -20,10 +20,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import degrees, isfinite, radians
 
+import numpy as np
+
+from fcslam.geometry import se2
 from fcslam.records import Beams, LaserModel
 from fcslam.sources.gate import TOLERATED_SHARE, usual_beams
-from fcslam.sources.logs.carmen import SICK_MAX_RANGE_M, ScanLine
-from fcslam.sources.pose import Pose, relative_pose
+from fcslam.sources.logs.carmen import SICK_MAX_RANGE_M, CarmenArrays
 
 _MOUNTING_TOLERANCE = 0.01
 """Largest difference between the mountings of two scans, in metres or radians."""
@@ -31,57 +33,28 @@ _FULL_TURN_DEG = 360.0
 _RESOLUTION_DEG = {101: 1.0, 201: 0.5, 401: 0.25, 541: 0.5, 1081: 0.25}
 
 
-def usual_log_beams(scans: Sequence[ScanLine], parameters: Mapping[str, str]) -> Beams:
-    """The usual beams of the first scans of a log."""
-    stated = [scan.stated.beams for scan in scans if scan.stated is not None]
+def usual_log_beams(log: CarmenArrays, most: int) -> Beams:
+    """The usual beams of the first ``most`` scans of a log."""
+    stated = [laser.beams for laser in log.stated[:most] if laser is not None]
     if stated:
         return usual_beams(stated)
-    (count, _), *_ = Counter(len(scan.ranges_m) for scan in scans).most_common(1)
-    return assumed_laser(count, parameters).beams
+    (count, _), *_ = Counter(map(len, log.ranges_m[:most])).most_common(1)
+    return assumed_laser(count, log.parameters).beams
 
 
-def beams_of(scan: ScanLine, declared: Beams) -> Beams | None:
-    """The beams that the line states, or those of the laser; None if there are more or fewer and no angles."""
-    if scan.stated is not None:
-        return scan.stated.beams
-    return declared if len(scan.ranges_m) == declared.beam_count else None
+def laser_model(log: CarmenArrays, scan: int, admitted: Sequence[int]) -> LaserModel:
+    """The laser of a scan, with the mounting on which the ``admitted`` scans agree, rounded to 0.1 mm.
 
-
-class MountingEstimate:
-    """Estimates the mounting of the laser from the two poses of every scan."""
-
-    def __init__(self) -> None:
-        self._count = 0
-        self._first: Pose | None = None
-        self._differing = 0
-
-    def add(self, scan: ScanLine) -> None:
-        """Add one scan."""
-        pose = (0.0, 0.0, 0.0)
-        if scan.T_odom_laser != scan.T_odom_base:
-            pose = relative_pose(scan.T_odom_base, scan.T_odom_laser)
-        self._count += 1
-        self._first = self._first or pose
-        if pose != self._first and max(map(abs, relative_pose(self._first, pose))) > _MOUNTING_TOLERANCE:
-            self._differing += 1
-
-    def T_base_laser(self, offset_m: float) -> Pose:
-        """The mounting on which the scans agree, rounded to 0.1 mm; otherwise ``offset_m`` ahead of the base.
-
-        Scans disagree if only one of their poses was corrected. They contain no mounting if both poses are equal.
-        """
-        assert self._first is not None
-        agreed = tuple(round(value, 4) + 0.0 for value in self._first)
-        if self._differing > TOLERATED_SHARE * self._count or not any(agreed):
-            return (offset_m, 0.0, 0.0)
-        return agreed[0], agreed[1], agreed[2]
-
-
-def laser_model(scan: ScanLine, parameters: Mapping[str, str], mounting: MountingEstimate) -> LaserModel:
-    """The laser of ``scan``."""
-    T_base_laser = mounting.T_base_laser(_parameter(parameters, "robot_frontlaser_offset") or 0.0)
-    stated = scan.stated or assumed_laser(len(scan.ranges_m), parameters)
-    return replace(stated, T_base_laser=T_base_laser)
+    Scans disagree if only one of their poses was corrected. They contain no mounting if both poses are equal. The
+    laser is then ahead of the base by the parameter of the robot.
+    """
+    mountings = se2.between(log.T_odom_base[admitted], log.T_odom_laser[admitted])
+    differing = np.abs(se2.between(mountings[0], mountings)).max(axis=1) > _MOUNTING_TOLERANCE
+    x, y, theta = (round(value, 4) + 0.0 for value in mountings[0].tolist())
+    if differing.sum() > TOLERATED_SHARE * len(admitted) or not (x or y or theta):
+        x, y, theta = _parameter(log.parameters, "robot_frontlaser_offset") or 0.0, 0.0, 0.0
+    stated = log.stated[scan] or assumed_laser(len(log.ranges_m[scan]), log.parameters)
+    return replace(stated, T_base_laser=(x, y, theta))
 
 
 def assumed_laser(beam_count: int, parameters: Mapping[str, str] | None = None) -> LaserModel:
