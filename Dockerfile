@@ -3,7 +3,7 @@
 #     docker build -t fcslam .
 #     docker run --rm -v "$PWD":/data fcslam map robot1.bag robot2.bag -o runs/building
 #     docker run -p 8340:8340 -v "$PWD":/data fcslam serve --data cloud --host 0.0.0.0 --credentials credentials
-FROM debian:bookworm-slim
+FROM debian:bookworm-slim@sha256:7b140f374b289a7c2befc338f42ebe6441b7ea838a042bbd5acbfca6ec875818
 
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends python3 python3-venv ca-certificates \

@@ -26,6 +26,15 @@ def test_every_package_has_hashes_and_the_version_of_the_constraints():
     assert {normal(name): version for name, (version, _) in found.items()}.items() <= constraints.items()
 
 
+def test_actions_and_the_base_image_are_named_by_their_content():
+    used = [
+        f for path in (ROOT / ".github" / "workflows").iterdir() for f in re.findall(r"uses: (\S+)", path.read_text())
+    ]
+    assert [action for action in used if not re.search("@[0-9a-f]{40}$", action)] == []
+    (base,) = re.findall(r"^FROM (\S+)", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    assert re.search("@sha256:[0-9a-f]{64}$", base)
+
+
 def test_every_dependency_is_among_them():
     project = (
         (ROOT / "pyproject.toml").read_text(encoding="utf-8").partition("\ndependencies = [")[2].partition("\n]")[0]

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-BASE = re.compile(r"debian:(\w+)-slim")
+BASE = re.compile(r"debian:(\w+)-slim(@sha256:[0-9a-f]{64})?")
 
 
 def steps(dockerfile: str) -> list[tuple[str, str]]:

@@ -24,6 +24,16 @@ def test_lines_are_appended_and_private(log, tmp_path):
     assert log.newest(1)[0].time == "1970-01-01T00:00:00Z"
 
 
+def test_of_a_large_log_only_the_end_is_read(log, tmp_path):
+    with (tmp_path / "audit.jsonl").open("wb") as file:
+        file.truncate(2**40)
+        file.seek(0, os.SEEK_END)
+        file.write(b"\n")
+    for number in range(3):
+        log.record("boss", "::1", "POST /x", 201, {"number": number})
+    assert [entry.content["number"] for entry in log.newest(3)] == [0, 1, 2]
+
+
 def test_what_cannot_be_written_is_said_and_stops_nothing(tmp_path, caplog):
     log = audit_file(tmp_path / "missing" / "audit.jsonl", lambda: 0.0)
     log.record("boss", "::1", "POST /x", 201, {})

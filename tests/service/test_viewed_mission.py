@@ -1,6 +1,7 @@
 """Runs of viewed missions: each is read once, and a run that was replaced is not kept."""
 
 import gc
+import threading
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 
@@ -13,6 +14,26 @@ def test_of_many_who_ask_at_once_one_reads(tmp_path):
     with ThreadPoolExecutor(8) as pool:
         runs = list(pool.map(viewed_run, [tmp_path / "1"] * 50))
     assert len(set(map(id, runs))) == 1
+
+
+def test_a_mission_whose_run_takes_long_to_read_delays_no_other(tmp_path):
+    begun, may_end = threading.Event(), threading.Event()
+
+    def read_slowly(_, maps):
+        begun.set()
+        assert may_end.wait(60.0)
+        assert not maps
+        return Run({})
+
+    with ThreadPoolExecutor(1) as pool:
+        slow = pool.submit(viewed_run, tmp_path / "slow" / "1", read_slowly)
+        assert begun.wait(60.0)
+        (tmp_path / "other").mkdir()
+        Run({}).save(tmp_path / "other" / "1")
+        assert viewed_run(tmp_path / "other" / "1") is not None
+        assert not slow.done()
+        may_end.set()
+    assert slow.result().trajectories == {}
 
 
 def test_only_the_newest_run_of_a_mission_is_kept(tmp_path):

@@ -146,7 +146,7 @@ class Robot(LiveTracker):
             executor = self._executor = wiring.started(stack)
             access = Server(server) if isinstance(server, str) else server
             sends = access is not None or wiring.transport is not None
-            folder = _state_folder(state, sends, stack)
+            folder = _state_folder(state, sends or wiring.keeps_keyframes, stack)
             outbox = (
                 None  # it refuses the folder of another robot or process, so it is opened before anything is deleted
             )
@@ -550,6 +550,8 @@ def _state_folder(given: StrPath | None, is_needed: bool, stack: ExitStack) -> P
     if given is None:
         return Path(stack.enter_context(TemporaryDirectory(prefix="fcslam-"))) if is_needed else None
     folder = Path(given)
+    if not is_needed:
+        raise InputError(f"{folder}: a robot without a server keeps nothing; give --server, or leave out --state")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

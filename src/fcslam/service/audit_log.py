@@ -5,7 +5,6 @@ import logging
 import math
 import os
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
@@ -18,6 +17,8 @@ from fcslam.storage.postgres import Postgres
 
 REFUSED_EVERY_S = 60.0
 """Refused logins make one line in this time at most, so no client without a token can fill the disk."""
+READ_BYTES = 2**20
+"""A log is read from its end, so much at a time."""
 
 _log = logging.getLogger(__name__)
 
@@ -90,11 +91,15 @@ def audit_file(path: Path, wall_clock: Callable[[], float] = time.time) -> Audit
             os.close(file)
 
     def lines(limit: int) -> list[bytes]:
-        try:
-            with path.open("rb") as file:
-                return list(deque(file, limit))
-        except FileNotFoundError:
+        if not path.exists():
             return []
+        with path.open("rb") as file:
+            begin, read = file.seek(0, os.SEEK_END), b""
+            while begin and read.count(b"\n") <= limit:
+                end, begin = begin, max(0, begin - READ_BYTES)
+                file.seek(begin)
+                read = file.read(end - begin) + read
+        return read.splitlines()[-limit:]
 
     return AuditLog(append, lines, wall_clock)
 

@@ -1,6 +1,7 @@
 """A mission as viewers see it. A live mission and a finished run have the same form, so one page shows both."""
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -54,21 +55,21 @@ def run_of(mission: ViewedMission) -> Run:
     return Run({}) if folder is None else viewed_run(folder)
 
 
-_reading = threading.Lock()
-"""Many robots and pages ask at once: one request reads a run, the others wait for it."""
+_reading: dict[Path, threading.Lock] = {}
+"""Many robots and pages ask at once: one request reads a run of a mission, the others about the mission wait for it."""
 _kept: dict[Path, tuple[object, Run]] = {}
 """The newest run of each mission, by the folder of its run folders. The one that was asked for last is the last."""
 
 
-def viewed_run(folder: Path) -> Run:
+def viewed_run(folder: Path, read: Callable[..., Run] = open_run) -> Run:
     """The run in a ``run_folder`` of a viewed mission, without its large files."""
     mission = folder.parent
-    with _reading:
+    with _reading.setdefault(mission, threading.Lock()):
         key = folder, identity(folder) if folder.exists() else None
         known, run = _kept.pop(mission, (None, None))
         if run is None or known != key:
-            run = open_run(folder, maps=False)
+            run = read(folder, maps=False)
         _kept[mission] = key, run
-        if len(_kept) > 4:
-            del _kept[next(iter(_kept))]
+        for old in list(_kept)[:-4]:
+            _kept.pop(old, None)
         return run

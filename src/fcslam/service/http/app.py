@@ -14,8 +14,8 @@ from prometheus_client import CONTENT_TYPE_LATEST
 import fcslam
 from fcslam.errors import StoreError
 from fcslam.service.audit_log import AuditEntry
+from fcslam.service.http.administration import administration_router
 from fcslam.service.http.authentication import Role
-from fcslam.service.http.decisions import decision_router
 from fcslam.service.http.fleet import event_router, fleet_router
 from fcslam.service.http.joint_maps import joint_map_router
 from fcslam.service.http.limits import RequestLimits
@@ -32,7 +32,7 @@ LARGEST_BACKLOG = 200
 PREFIX = "/api/v1"
 VIEWER_ROUTERS = (fleet_router, map_router, event_router)
 """Routes of the page; they read."""
-ROUTERS = (robot_router, joint_map_router, detector_router, mission_router, decision_router)
+ROUTERS = (robot_router, joint_map_router, detector_router, mission_router, administration_router)
 
 
 def operations_router(state: ServiceState) -> APIRouter:

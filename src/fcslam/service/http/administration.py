@@ -1,4 +1,4 @@
-"""Decisions about the open mission: results, edits, detectors."""
+"""Routes of administrators about the open mission: results, edits, detectors."""
 
 import asyncio
 import json
@@ -36,7 +36,7 @@ class NewEdit(StrictModel):
     )
 
 
-def decision_router(state: ServiceState) -> APIRouter:
+def administration_router(state: ServiceState) -> APIRouter:
     """Results, edits and detectors."""
     router = APIRouter(
         tags=["decisions"], dependencies=state.require(Role.ADMIN), responses=refusals(401, 403, 503, 507)
