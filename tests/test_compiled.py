@@ -80,3 +80,19 @@ def test_the_cache_holds_what_was_compiled(tmp_path):
     )
     outputs = [run(script, NUMBA_CACHE_DIR=str(tmp_path / "cache")).stdout for _ in range(2)]
     assert outputs == ["False 2 True 0\n", "True 2 True 1\n"]
+
+
+def test_the_runtime_of_numba_is_loaded_as_other_code_is(tmp_path):
+    (tmp_path / "module.py").write_text(
+        MODULE.replace("return x + 1", "return np.full(3, x)[1:]") + "import numpy as np\n"
+    )
+    script = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "from numba.core.runtime import nrtdynmod\n"
+        "made, make = [], nrtdynmod.create_nrt_module\n"
+        "nrtdynmod.create_nrt_module = lambda context: made.append(1) or make(context)\n"
+        "from module import f\n"
+        "print(*f(2), len(made))"
+    )
+    outputs = [run(script, NUMBA_CACHE_DIR=str(tmp_path / "cache")).stdout for _ in range(2)]
+    assert outputs == ["2 2 1\n", "2 2 0\n"]

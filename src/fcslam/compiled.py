@@ -14,8 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator, UserWideCacheLocator
-from numba.core.runtime import rtsys
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    UserProvidedCacheLocator,
+    UserWideCacheLocator,
+)
+from numba.core.runtime import nrtdynmod, rtsys
 
 _uncached: list[str] = []
 
@@ -63,6 +69,30 @@ def _load_array_functions() -> None:
         linalg.ensure_blas = ensure_blas
 
 
+@cache
+def _initialize_runtime(context: Any, folder: str) -> None:
+    """Initialise the runtime of numba by machine code from a folder: the compiler's pages would take 20 MB."""
+    compile_runtime, codegen = nrtdynmod.compile_nrt_functions, context.codegen()
+    file, machine = IndexDataCacheFile(folder, "runtime", ""), codegen.magic_tuple()
+
+    def load_runtime(context: Any) -> Any:
+        stored = file.load(machine)
+        if stored is not None:
+            return codegen.unserialize_library(stored)
+        library = codegen.create_library("nrt")
+        library.enable_object_caching()
+        library.add_ir_module(nrtdynmod.create_nrt_module(context)[0])
+        library.finalize()
+        file.save(machine, library.serialize_using_object_code())
+        return library
+
+    nrtdynmod.compile_nrt_functions = load_runtime
+    try:
+        rtsys.initialize(context)
+    finally:
+        nrtdynmod.compile_nrt_functions = compile_runtime
+
+
 class _CachedCode(CompileResultCacheImpl):  # type: ignore[misc]
     """Finds the folder for machine code: not in an installed package, as ``pip uninstall`` would leave it there."""
 
@@ -82,8 +112,8 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """As numba's, but it does not load all that only the compiler needs, which takes 0.2 s and 11 MB."""
         _load_array_functions()
-        rtsys.initialize(target_context)
         with suppress(OSError), self._locked():
+            _initialize_runtime(target_context, self.cache_path)
             return self._load_overload(sig, target_context)
         return None
 

@@ -50,6 +50,7 @@ from fcslam.records import (
 )
 from fcslam.robot.backend import OwnPlaces
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.sources.logs.carmen import numbers_in
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.packets import encode, measure
 from fcslam.wire.quantisation import dequantise, rounded
@@ -64,10 +65,11 @@ _STEPS = 30
 
 
 def warm_up_scans() -> None:
-    """Compile what the first scans of a robot need: points, normals, the field, matching, and the search.
+    """Compile what the first scans of a robot need: a log, points, normals, the field, matching, and the search.
 
     Scans without points compile the same code.
     """
+    numbers_in(b"1 2", 2)
     scan = next(made_up_scans(1))
     field_of([(point_scan(scan.ranges_m, scan.laser, Sweep(0.0, 0.1)), np.zeros(3))])
     match_scan(_EMPTY_SCAN, SurfelField(np.zeros(2)), np.zeros(3), np.zeros((3, 3)))

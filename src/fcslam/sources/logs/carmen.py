@@ -116,12 +116,12 @@ class CarmenArrays:
     def _flaser(self, line: bytes) -> int:
         front, *tail = line.rsplit(None, 9)
         _, count, *text = front.split(None, 2)
-        values, rest = _numbers(b"".join(text), int(count))
+        values, rest = numbers_in(b"".join(text), int(count))
         if len(values) and not rest.strip():
             return self._scan(_stamp_of(tail[6]), tail[:6], values)
         front, *tail = line.rsplit(None, 6)
         _, _, *text = front.split(None, 2)
-        values, rest = _numbers(b"".join(text), int(count))
+        values, rest = numbers_in(b"".join(text), int(count))
         if rest.strip():
             raise ValueError("not as many ranges as stated")
         return self._scan(None, tail, values)
@@ -178,7 +178,7 @@ class CarmenArrays:
 def _measured(front: bytes) -> tuple[FloatArray, LaserModel]:
     """Ranges and laser in a line up to its remissions."""
     _, kind, start, fov, resolution, max_range, _, _, count, text = front.split(None, 9)
-    values, rest = _numbers(text, int(count))
+    values, rest = numbers_in(text, int(count))
     remission_count, *remissions = rest.split()
     if len(remissions) != int(remission_count):
         raise ValueError("not as many remissions as stated")
@@ -186,7 +186,7 @@ def _measured(front: bytes) -> tuple[FloatArray, LaserModel]:
     return values, _stated_laser(int(kind), numbers, len(values))
 
 
-def _numbers(text: bytes, count: int) -> tuple[FloatArray, bytes]:
+def numbers_in(text: bytes, count: int) -> tuple[FloatArray, bytes]:
     """The first ``count`` numbers of a text, and what follows them; none if it has fewer."""
     if not 2 <= count <= len(text):
         return np.zeros(0), text
