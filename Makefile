@@ -41,9 +41,9 @@ export PYTHONDONTWRITEBYTECODE :=
 
 help:
 	@echo "make demo         simulate a fleet, map it, evaluate it against ground truth, draw the result"
-	@echo "make test         all tests that need no recordings"
+	@echo "make test         all tests that need no real server and no recordings"
 	@echo "make test-fast    the same without the slow tests"
-	@echo "make test-system  the tests on real recordings (set FCSLAM_DATA to their folder)"
+	@echo "make test-system  the tests with real servers and on recordings (set FCSLAM_DATA to their folder)"
 	@echo "make test-all     test and test-system in one run"
 	@echo "make test-training federated training, with attackers and with real processes; run make learning first"
 	@echo "make test-attack  the tests that play an attacker against own servers on this machine"

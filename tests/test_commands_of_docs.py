@@ -49,7 +49,7 @@ OF = {LONG: ANNA, MEETS: BEN}
 """Sample logs of other names. The long one has relations over 20 s."""
 LOGS = {
     "robot1.clf.gz": ANNA, "robot1.clf": ANNA, "monday.clf.gz": ANNA, "monday.clf.xz": ANNA,
-    "building.clf.gz": LONG, "lift.clf.gz": LONG, "intel.clf.xz": LONG,
+    "building.clf.gz": LONG, "lift.clf.gz": LONG,
     "robot2.log": BEN, "robot2.clf": BEN, "tuesday.clf.gz": BEN, "tuesday.clf.xz": MEETS,
     "robot3.log": CLEO, "today.clf.gz": CLEO, "today.clf.xz": CLEO,
     "examples/logs/anna.clf.xz": ANNA, "examples/logs/ben.clf.xz": BEN, "examples/logs/cleo.clf.xz": CLEO,
@@ -131,7 +131,6 @@ def make_demo(path: Path) -> None:
 MADE = {
     "demo/recordings": make_demo,
     "building.relations.gz": make_relations("in-one"),
-    "intel.relations.gz": make_relations("intel"),
     "wednesday.clf.gz": make_another_day,
     "wednesday.clf.xz": make_another_day,
     "office.yaml": make_map_of_another_program,
@@ -239,7 +238,7 @@ def downloads(port: int) -> set[tuple[str, str]]:
     return {(file, url.replace("8340", str(port))) for file, url in shown_here}
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_two_robots_and_a_service_as_the_pages_show_them(logs, desk, capsys):
     for name, long in (("anna", LONG), ("ben", MEETS)):  # after 45 scans, the evidence for a join is at its limit
         (link := desk / "examples" / "logs" / f"{name}.clf.xz").unlink()
@@ -278,7 +277,7 @@ def test_two_robots_and_a_service_as_the_pages_show_them(logs, desk, capsys):
     assert service.returncode == 130
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_the_pages_of_runs_are_served(desk):
     assert main(["map", "robot1.clf", "-o", "runs/sample", "--quiet"]) == 0
     (desk / "runs" / "building").symlink_to("sample")

@@ -235,7 +235,7 @@ def test_a_removed_robot_leaves_no_trace_and_its_undo_neither(tmp_path, packets)
 
 
 @pytest.mark.attack
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize("options", [(), ("--insecure",)])
 def test_a_service_without_tokens_answers_to_no_other_name(tmp_path, options):
     """As when a web page points its own name to 127.0.0.1."""

@@ -85,7 +85,7 @@ def test_a_limit_that_is_not_one_is_told(tmp_path, capsys, monkeypatch):
     assert "FCSLAM_MAX_MISSIONS=few" in refused(["postgresql://u@h/d"], tmp_path, capsys)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 def test_an_instance_shows_no_password_survives_its_database_and_ends_in_order(postgres, postgres_server, tmp_path):
     for table in ("missions", "instances"):
         postgres.rows(f"DELETE FROM {table} RETURNING 1")

@@ -97,7 +97,7 @@ class Command:
         return httpx.get(f"{self.url}{path}", timeout=30.0)
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize(("option", "end"), [("--open", signal.SIGINT), ("--no-open", signal.SIGTERM)])
 def test_a_browser_opens_if_it_may_and_ctrl_c_ends_the_page_with_success_also_while_somebody_looks(
     run, tmp_path, option, end

@@ -34,7 +34,7 @@ NEVER_FORGETS = FleetConfig(matcher=MatcherConfig(most_nearby=10**6, most_sessio
 
 @pytest.fixture(scope="module")
 def drawn():
-    return small_fleet.draw(SESSIONS, path_length_m=20.0, seed=1)
+    return small_fleet.draw(SESSIONS, path_length_m=15.0, seed=1)
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,7 @@ def weights(network):
 
 @pytest.mark.slow
 def test_a_run_learns(examples, tmp_path):
-    longer = SMALL.model_copy(update={"steps": 40, "pairs": 2})
+    longer = SMALL.model_copy(update={"steps": 40, "pairs": 1})
     figures = []
     TrainingRun(longer, tmp_path, PACE).train(
         examples, examples[:1], on_progress=lambda _step, _steps, metrics, _warnings: figures.append(metrics)

@@ -1,6 +1,7 @@
 """A robot gets another detector on the way: what it sends from then on, and what becomes of its places of before."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 
@@ -23,7 +24,11 @@ pytestmark = pytest.mark.slow
 
 WITH_ORB = RobotConfig(channels=(Channel.CAMERA,), views=ViewsConfig(detector=DetectorKind.ORB))
 WITH_NETWORK = RobotConfig(channels=(Channel.CAMERA,))
-SHIPPED = describe_detector_file(BUNDLED_NETWORK)
+
+
+@cache
+def shipped():
+    return describe_detector_file(BUNDLED_NETWORK)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +41,7 @@ def driven(robot, records, switch_after=None):
     packets = []
     for number, record in enumerate(records):
         if number == switch_after:
-            robot.set_detector(SHIPPED, BUNDLED_NETWORK)
+            robot.set_detector(shipped(), BUNDLED_NETWORK)
         packets += robot.process(record)
     return packets + robot.finish()
 
@@ -53,13 +58,13 @@ def test_old_places_are_described_again_and_new_ones_by_the_new_detector_alone(s
     first, second = (packets[k].body for k in hellos)
     assert first.lasers == second.lasers
     orb = first.detector_versions[Channel.CAMERA]
-    assert second.detector_versions == {Channel.CAMERA: SHIPPED.version}
+    assert second.detector_versions == {Channel.CAMERA: shipped().version}
     before, after = packets[: hellos[1]], packets[hellos[1] :]
     assert places(before, orb)
-    assert not places(before, SHIPPED.version)
+    assert not places(before, shipped().version)
     assert not places(after, orb)
     old = {place.id: (place.first, place.last) for place in places(before, orb)}
-    described = {place.id: (place.first, place.last) for place in places(after, SHIPPED.version)}
+    described = {place.id: (place.first, place.last) for place in places(after, shipped().version)}
     assert old.items() <= described.items()
     assert max(described) > max(old)
     # As if it had never had another: where the detector is the same, so are its places.
@@ -75,7 +80,7 @@ def content(packets):
 def test_a_detector_that_comes_before_the_first_scan_is_announced_once(seen):
     packets = driven(RobotFrontend("r", WITH_ORB), seen[:40], 0)
     (hello,) = [packet.body for packet in packets if isinstance(packet.body, Hello)]
-    assert hello.detector_versions == {Channel.CAMERA: SHIPPED.version}
+    assert hello.detector_versions == {Channel.CAMERA: shipped().version}
 
 
 def test_going_back_and_forth_describes_nothing_twice(seen, tmp_path):
@@ -90,7 +95,7 @@ def test_going_back_and_forth_describes_nothing_twice(seen, tmp_path):
     robot.set_detector(describe_detector_file(tmp_path / "tiny.onnx"), tmp_path / "tiny.onnx")
     packets += robot.finish()  # the last change is reported even though no scan comes after it
     announced = [packet.body.detector_versions[Channel.CAMERA] for packet in packets if isinstance(packet.body, Hello)]
-    assert announced == [SHIPPED.version, "tiny-1", SHIPPED.version, "tiny-1"]
+    assert announced == [shipped().version, "tiny-1", shipped().version, "tiny-1"]
     described = [(p.body.id, p.body.detector_version) for p in packets if isinstance(p.body, Place)]
     assert len(described) == len(set(described))
     assert {id for id, version in described if version == "tiny-1"} == {id for id, _ in described}
@@ -103,7 +108,7 @@ def test_what_is_not_the_file_that_was_announced_changes_nothing(seen, tmp_path)
     (tmp_path / "cut.onnx").write_bytes((tmp_path / "tiny.onnx").read_bytes()[:-1])
     robot = RobotFrontend("r", WITH_ORB)
     for file, path, reason in (
-        (SHIPPED, tmp_path / "tiny.onnx", "is not the file"),
+        (shipped(), tmp_path / "tiny.onnx", "is not the file"),
         (tiny, tmp_path / "cut.onnx", "is not the file"),
         (tiny, tmp_path / "missing.onnx", "cannot be read"),
         (replace(tiny, version="tiny-2"), tmp_path / "tiny.onnx", "holds detector tiny-1"),
@@ -144,7 +149,7 @@ def between(result):
 def test_places_of_before_match_what_others_see_once_they_are_described_again(fleet):
     joined = received([*fleet["switched"], *fleet["new"]])
     assert {robot.map_index for robot in joined.robots} == {0}
-    described = {place.id for place in places(fleet["switched"], SHIPPED.version)}
+    described = {place.id for place in places(fleet["switched"], shipped().version)}
     of_old = {end for closure in between(joined) for end in (closure.i, closure.j) if end.robot == "old"}
     assert of_old
     assert of_old <= described

@@ -416,7 +416,7 @@ def content(run):
 
 @pytest.mark.parametrize(
     ("change", "restarts"),
-    [(Removal("b"), True), (Removal("b", 0), False), (Veto("a", "b"), False), (FloorLabel("b", "2"), True)],
+    [(Removal("b"), True), (Veto("a", "b"), False), (FloorLabel("b", "2"), True)],
     ids=str,
 )
 def test_an_edit_and_its_undo_leave_what_would_have_been_without_them(cloud, change, restarts):

@@ -20,7 +20,7 @@ ITSELF = '[parameters]\n"path.robot" = "a"\n'
 """An addition to the configuration: a robot's token is valid for that robot alone."""
 
 
-@pytest.mark.slow
+@pytest.mark.system
 @pytest.mark.parametrize(("options", "more"), [(AS_BOSS, ""), (AS_ROBOT, ITSELF)], ids=["admin", "robot"])
 def test_the_service_answers_as_it_is_described(tmp_path, scripted, options, more):
     scripted(SCRIPT)
