@@ -132,7 +132,7 @@ def posts(seed):
 
 @pytest.mark.parametrize("slip", [(0.7, 0.0, 0.0), (-0.7, 0.0, np.deg2rad(2))])
 def test_a_slip_is_found_although_a_wrong_match_explains_what_is_known(slip):
-    """The far wall fits at the wrong pose too; that the scan is far less likely than usual tells the slip."""
+    """The far wall fits at the wrong pose too; after a long step, the tracker compares other poses."""
     laser = LaserModel(361, -0.5 * np.pi, np.pi / 360, 30.0)
     truth = drive([(-4.0, 1.2), (4.0, 1.2)])
     odometry = slipped(true_steps(truth, np.random.default_rng(5)), 50, slip)

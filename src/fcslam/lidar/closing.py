@@ -155,7 +155,15 @@ class LoopCloser:
             for earlier in candidates[: 1 if is_known else MOST_CANDIDATES]
             if (closure := self._compare(earlier, later, anchors, paths[earlier])) is not None
         ]
-        return self._accept(found, self._recognized(later, anchors, paths), anchors)
+        accepted = [c for c in found if self._is_expected(c) or self._is_conclusive(c)]
+        unsure = [c for c in found if c not in accepted]
+        if self._recognizer is not None:
+            self._recognizer.store(keyscan, self._submap(later).surface.points)
+            if not accepted:
+                compared = {c.earlier for c in found}
+                recognized = self._recognized(self._recognizer, later, anchors, paths)
+                unsure += [c for c in recognized if c.earlier not in compared]
+        return self._accept(accepted, unsure, anchors)
 
     def _forget_surplus(self, anchors: FloatArray) -> bool:
         held = np.array(list(self._held))
@@ -220,19 +228,17 @@ class LoopCloser:
         beyond = recognized is not None and (off_m > radius or off_rad > angle)
         return LocalClosure(earlier, later, check, innovation, radius, beyond)
 
-    def _recognized(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[LocalClosure]:
+    def _recognized(
+        self, recognizer: PlaceRecognizer, later: int, anchors: FloatArray, paths: FloatArray
+    ) -> list[LocalClosure]:
         """The best closure that place recognition proposes beyond the search's reach.
 
         Nothing predicts it, so a submap that fits two parts of the map proves neither, and gives none.
         """
-        if self._recognizer is None:
-            return []
-        newest = self.keyscans[later]
-        self._recognizer.store(newest, self._submap(later).surface.points)
         found = [
             closure
-            for earlier in self._lookalikes(self._recognizer, later, anchors, paths)
-            for guess in self._recognizer.motions(self.keyscans[earlier], newest)
+            for earlier in self._lookalikes(recognizer, later, anchors, paths)
+            for guess in recognizer.motions(self.keyscans[earlier], self.keyscans[later])
             if (closure := self._compare(earlier, later, anchors, paths[earlier], guess)) is not None
         ]
         if len(found) > 1 and not consistency(found, self._travel, anchors).all():
@@ -256,12 +262,9 @@ class LoopCloser:
         return chosen[:MOST_CANDIDATES]
 
     def _accept(
-        self, found: list[LocalClosure], recognized: list[LocalClosure], anchors: FloatArray
+        self, accepted: list[LocalClosure], unsure: list[LocalClosure], anchors: FloatArray
     ) -> list[LocalClosure]:
-        accepted = [c for c in found if self._is_expected(c) or self._is_conclusive(c)]
-        pairs = {(c.earlier, c.later) for c in found}
-        fresh = [c for c in recognized if (c.earlier, c.later) not in pairs]
-        self._pending += [c for c in (*found, *fresh) if c not in accepted and c.check.support]
+        self._pending += [c for c in unsure if c.check.support]
         self._pending = [c for c in self._pending if self._travel[-1] - self._travel[c.later] < PENDING_M]
         cluster = supported(self._pending, self._travel, anchors)
         accepted += cluster

@@ -23,12 +23,10 @@ SEARCH_SIGMA_M = 0.02
 """Limit in metres, for a match that explains the known area: its points must fix the position so well in every
 direction. Along a bare wall the points hardly distinguish poses, and the pattern of the beams favours some.
 """
-LONG_STEP_M, LONG_STEP_RAD, JUMP_SHARE = 0.3, 0.35, 0.85
+LONG_STEP_M, LONG_STEP_RAD, JUMP_SHARE, JUMP_GAIN = 0.3, 0.35, 0.85, 20.0
 """Odometry may jump, as when its driver restarts at zero. After a step so long that the scan contradicts, the robot is
 also looked for where it was. There the scan must show what it did before: so large a share of the points on surfaces,
-and a log-likelihood higher by twice ``UNLIKELY``."""
-USUAL_WEIGHT, USUAL_STEP = 0.05, 0.1
-"""The usual log-likelihood per point follows each match with this weight, and by at most this difference."""
+and a log-likelihood higher by ``JUMP_GAIN``."""
 LARGEST_VELOCITY = 30.0
 """Largest velocity of a robot in a sweep, m/s and rad/s: a match that says more is wrong."""
 PRIOR_SCALE = 3.0
@@ -57,8 +55,6 @@ DOUBTFUL = 0.75
 """Least share of the points in known area on surfaces; below it, a correlative search starts."""
 SEARCH_WINDOW = SearchWindow(radius_m=1.0, angle_rad=0.5)
 """The correlative search after a doubtful match."""
-UNLIKELY = 10.0
-"""A match whose log-probability is lower than usual by this starts a correlative search."""
 
 
 class TrackedScan(NamedTuple):
@@ -90,8 +86,6 @@ class TrackerState(NamedTuple):
     """Mountings of the lasers whose scans were matched since the robot last moved."""
     trust: OdometryTrust = OdometryTrust()
     """Trust in odometry, learned from all matches."""
-    usual: float = math.nan
-    """Usual log-likelihood of a scan per point, learned from the latest matches; NaN before the first."""
 
 
 class TrackingResult(NamedTuple):
@@ -147,7 +141,7 @@ class ScanTracker:
         if match.explained < DOUBTFUL and self._is_long_step(T_local_guess):
             other = self._match(points, thinned, state.T_local_base, error, velocity)
             is_fixed = weakest_sigma_m(other.information) < SEARCH_SIGMA_M
-            is_better = other.log_likelihood > match.log_likelihood + 2.0 * UNLIKELY
+            is_better = other.log_likelihood > match.log_likelihood + JUMP_GAIN
             if is_fixed and is_better and other.explained >= JUMP_SHARE:
                 match, T_local_guess, has_jumped = other, state.T_local_base, True
         if self._odometry.is_measured:  # a prediction was right only as long as the motion went on as before
@@ -168,7 +162,6 @@ class ScanTracker:
             scan.T_odom_base,
             matched_here=matched_here,
             trust=state.trust.learn(innovation, error, self._measured(scan)) if learns else state.trust,
-            usual=_learn_usual(state.usual, match.log_likelihood / max(1, len(thinned))),
         )
         return TrackingResult(tracked, accepted, match.explained, match.known)
 
@@ -257,21 +250,18 @@ class ScanTracker:
             tail = PRIOR_TAIL if self._state.trust.matches >= FIRST_MATCHES else math.inf
             match = match_scan(thinned, field, T_local_guess, prior.information, velocity, prior_tail=tail)
         innovation = se2.motion(T_local_guess, match.T_field_base)
-        log_posterior = match.log_likelihood + learned.log_likelihood(innovation)
         is_doubtful = match.explained < DOUBTFUL * match.known or learned.mahalanobis2(innovation) >= FAR**2
-        is_unlikely = log_posterior < self._state.usual * len(thinned) - UNLIKELY  # False before the first match
-        if not is_doubtful and not is_unlikely:
+        if not is_doubtful and not self._is_long_step(T_local_guess):
             return match
         found = search(points, field, T_local_guess, SEARCH_WINDOW, visible_only=True, better_than=match.T_field_base)
         if np.array_equal(found.T_field_base, match.T_field_base):
             return match
         other = match_scan(thinned, field, found.T_field_base, NO_INFORMATION, velocity)
-        other_innovation = se2.motion(T_local_guess, other.T_field_base)
+        gain = other.log_likelihood + learned.log_likelihood(se2.motion(T_local_guess, other.T_field_base))
+        gain -= match.log_likelihood + learned.log_likelihood(innovation)
         # The best of many poses explains some points by chance.
         is_fixed = is_doubtful or weakest_sigma_m(other.information) < SEARCH_SIGMA_M
-        if is_fixed and other.log_likelihood + learned.log_likelihood(other_innovation) > log_posterior + CLEAR_GAIN:
-            return other
-        return match
+        return other if is_fixed and gain > CLEAR_GAIN else match
 
 
 def _likeliest(
@@ -294,12 +284,6 @@ def _corrected(sweep: Sweep | None, velocity: FloatArray) -> Sweep | None:
         return None
     x, y, theta = np.clip(np.add(sweep.velocity, velocity), -LARGEST_VELOCITY, LARGEST_VELOCITY).tolist()
     return sweep._replace(velocity=(x, y, theta))
-
-
-def _learn_usual(usual: float, likelihood: float) -> float:
-    if math.isnan(usual):
-        return likelihood
-    return usual + USUAL_WEIGHT * min(max(likelihood - usual, -USUAL_STEP), USUAL_STEP)
 
 
 def _is_good(match: ScanMatch, error: OdometryError) -> bool:
