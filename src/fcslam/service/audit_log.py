@@ -84,11 +84,8 @@ def audit_file(path: Path, wall_clock: Callable[[], float] = time.time) -> Audit
     """A log in a file that is written in one thread and may be read in any."""
 
     def append(line: bytes) -> None:
-        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
-        try:
-            os.write(file, line + b"\n")
-        finally:
-            os.close(file)
+        with open(path, "ab", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+            file.write(line + b"\n")
 
     def lines(limit: int) -> list[bytes]:
         if not path.exists():

@@ -219,10 +219,8 @@ class Intake:
 
     def _limit_packets(self, robot: str, batch: Sequence[bytes]) -> None:
         unpacked = sum(map(unpacked_size, batch))  # unpacking takes time
-        wait_s = self._packet_rate.wait_s(robot, max(1.0, len(batch), unpacked / PACKET_BYTES))
-        if wait_s > 0.0:
-            limit = f"{self._limits.packets_per_s:g} packets of {PACKET_BYTES} bytes per second (fleet.claims)"
-            raise BusyError(f"{robot}: over {limit}; send the others in {wait_s:.0f} s", wait_s)
+        limit = f"{self._limits.packets_per_s:g} packets of {PACKET_BYTES} bytes per second"
+        _take_tokens(self._packet_rate, robot, max(1.0, len(batch), unpacked / PACKET_BYTES), limit)
 
     def _limit_refused(self, robot: str, sends: bool) -> int:
         """How many packets of a robot were refused; if they are too many, it sends no more in this mission."""
@@ -239,10 +237,7 @@ class Intake:
         with self._lock:
             names = [session_name(robot, epoch) for epoch in epochs]
             new = sum(1 for name in names if not self._log.next_sequence(name) and not self._log.waiting_count(name))
-        wait_s = self._session_rate.wait_s(robot, new) if new else 0.0
-        if wait_s > 0.0:
-            limit = f"{self._limits.sessions_per_hour:g} sessions per hour (fleet.claims)"
-            raise BusyError(f"{robot}: over {limit}; the next one can begin in {wait_s:.0f} s", wait_s)
+        _take_tokens(self._session_rate, robot, new, f"{self._limits.sessions_per_hour:g} sessions per hour")
 
     def _make_room(self, robot: str, numbers: Sequence[tuple[str, int, int]]) -> None:
         """Refuse, for now, what would make the robot's packets that wait too many."""
@@ -272,6 +267,12 @@ class Intake:
         versions = {} if hello is None else hello.detector_versions
         packets = replies(robot, expected, correction, known_correction, announced, versions)
         return write_batch(map(encode, packets))
+
+
+def _take_tokens(buckets: TokenBuckets, robot: str, cost: float, limit: str) -> None:
+    wait_s = buckets.wait_s(robot, cost)
+    if wait_s > 0.0:
+        raise BusyError(f"{robot}: over {limit} (fleet.claims); send the others in {wait_s:.0f} s", wait_s)
 
 
 def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], RefusedPacketError | None]:

@@ -71,7 +71,8 @@ class OpenMission:
         return existing_result(self.folder, name)
 
     def sessions(self, robot: str | None = None) -> list[SessionState]:
-        """Sessions of one robot or of all, by robot and epoch."""
+        """Sessions of one robot or of all, by robot and epoch, whoever received their packets."""
+        self.intake.follow()
         return self.intake.sessions(robot)
 
     def last_heard_s(self, robot: str) -> float | None:
@@ -80,6 +81,7 @@ class OpenMission:
 
     def packet_counts(self) -> PacketCounts:
         """How far the packets of all robots are."""
+        self.intake.follow()
         counts = self.intake.ready_count(), self.store.applied(), self.intake.waiting_count()
         return PacketCounts(*counts, self.worker.is_ready)
 

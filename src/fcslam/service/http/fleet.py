@@ -31,6 +31,7 @@ from fcslam.service.http.responses import (
     FleetSummary,
     LearningRound,
     MapJoin,
+    PacketRefusal,
     RobotSummary,
     SessionSummary,
     file_of,
@@ -38,7 +39,7 @@ from fcslam.service.http.responses import (
     response_of,
     unless_known,
 )
-from fcslam.service.http.robots import Name, refused_packets
+from fcslam.service.http.robots import Name
 from fcslam.service.http.state import ViewerState
 from fcslam.service.keyscans import live_pose, live_scan, overlay_png
 from fcslam.service.viewed_mission import ViewedMission, run_of
@@ -98,7 +99,9 @@ def fleet_router(state: ViewerState) -> APIRouter:
         sessions = _sessions_of(state.mission, robot)
         if not sessions:
             raise HTTPException(404, f"there is no robot '{robot}'")
-        return RobotSummary(robot=robot, sessions=sessions, refused=refused_packets(state.mission.store, robot))
+        refused = state.mission.store.refusals(robot)
+        refusals = [PacketRefusal(epoch=one[0], sequence=one[1], reason=one[2]) for one in refused]
+        return RobotSummary(robot=robot, sessions=sessions, refused=refusals)
 
     @router.get("/closures", response_model=list[ClosureSummary], responses=refusals(400))
     def get_closures(

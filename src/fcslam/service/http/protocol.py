@@ -21,8 +21,6 @@ MOST_CONNECTIONS = 4096
 """Connections at a time."""
 WRITE_S = 20.0
 """Time for a client to read what fills the buffers of its connection, 64 KiB and those of the system."""
-REFUSAL_S = 5.0
-"""Time until what is no HTTP is answered."""
 IDLE_S = 10.0
 """Time for a TLS handshake, and for the header of a request, from the connection or the response before."""
 PAUSE_S = 0.001
@@ -132,21 +130,18 @@ class GuardedProtocol(H11Protocol):
     """When the client stopped to read what is sent; None: it reads."""
     _idle_since = 0.0
     """Time of the loop when the connection was seen without a request first."""
-    _look: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """After the handshake: a client certificate, if there is one, was signed by the trusted authority."""
         super().connection_made(transport)
         self._idle_since = self.loop.time()
-        self._look = self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
+        self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
         if len(self.connections) > most_connections():
             self._make_room()
         self._pass_connection(transport)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """The client or a limit closed the connection."""
-        if self._look is not None:
-            self._look.cancel()
         turn = self._state.get(WAITING)
         if turn is not None and not turn.done():
             turn.set_result(False)
@@ -191,15 +186,6 @@ class GuardedProtocol(H11Protocol):
         self._stuck_since = None
         super().resume_writing()
 
-    def send_400_response(self, msg: str) -> None:
-        """Answer what is no HTTP, but late, so that whoever sends it again and again waits."""
-        self.transport.pause_reading()
-        self.loop.call_later(REFUSAL_S, self._refuse, msg)
-
-    def _refuse(self, msg: str) -> None:
-        if not self.transport.is_closing():
-            super().send_400_response(msg)
-
     def _enforce_timeouts(self) -> None:
         """Close the connection if it has been idle, or its client has read nothing, for too long."""
         now = self.loop.time()
@@ -207,8 +193,8 @@ class GuardedProtocol(H11Protocol):
             self._idle_since = now
         if now - self._idle_since > IDLE_S or (self._stuck_since is not None and now - self._stuck_since > WRITE_S):
             self.close()
-        else:
-            self._look = self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
+        elif not self.transport.is_closing():
+            self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
 
     def _make_room(self) -> None:
         """Close a tenth of the connections of the holder that has most; those whose body has not come, then the oldest.

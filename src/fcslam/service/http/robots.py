@@ -6,7 +6,6 @@ from fastapi import APIRouter, Header, HTTPException, Path, Request
 from fastapi.responses import FileResponse, Response
 from starlette.concurrency import run_in_threadpool
 
-from fcslam.mission.mission_store import MissionStore
 from fcslam.records import NAME, Channel
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import read_body
@@ -86,7 +85,7 @@ def robot_router(state: ServiceState) -> APIRouter:
             correction=correction.correction.version if correction else -1,
             map=correction.correction.map_index if correction else None,
             refusals=store.refused(robot).count,
-            refused=refused_packets(store, robot),
+            refused=[PacketRefusal(epoch=one[0], sequence=one[1], reason=one[2]) for one in store.refusals(robot)],
         )
 
     return router
@@ -119,11 +118,3 @@ def detector_router(state: ServiceState) -> APIRouter:
         return FileResponse(path, media_type=NETWORK)
 
     return router
-
-
-def refused_packets(store: MissionStore, robot: str) -> list[PacketRefusal]:
-    """The last refused packets of a robot."""
-    return [
-        PacketRefusal(epoch=epoch, sequence=sequence, reason=reason)
-        for epoch, sequence, reason in store.refusals(robot)
-    ]

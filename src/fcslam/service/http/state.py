@@ -2,7 +2,7 @@
 
 import asyncio
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -121,21 +121,19 @@ class ServiceState:
         async def check(request: Request) -> None:
             if self.closing:
                 raise HTTPException(503, "the service is stopping; try again")
-            if self.authenticator.is_open:
-                self._note(request, ANYBODY, roles)
-                return
-            who: Identity | None = request.scope["state"][WHO]
-            if who is None:
+            who: Identity | None = request.scope.get("state", {}).get(WHO)
+            if who is None and not self.authenticator.is_open:
                 headers = {"WWW-Authenticate": "Bearer"}
                 raise HTTPException(
                     401, "no known token and no robot's certificate; send Authorization: Bearer TOKEN", headers
                 )
-            self._note(request, who.name, roles)
-            if who.role not in roles:
+            if set(roles) == {Role.ADMIN}:  # the handler and the audit log learn who asks
+                setattr(request.state, ACTOR, ANYBODY if who is None else who.name)
+            if who is not None and who.role not in roles:
                 needed = " or ".join(roles)
                 raise HTTPException(403, f"'{who.name}' is a {who.role}; this needs the role {needed}")
             robot = request.path_params.get("robot")
-            if who.role is Role.ROBOT and robot not in (None, who.name):
+            if who is not None and who.role is Role.ROBOT and robot not in (None, who.name):
                 raise HTTPException(403, f"robot '{who.name}' does not speak for robot '{robot}'")
 
         # the second one tells OpenAPI of tokens, and does nothing else
@@ -152,9 +150,3 @@ class ServiceState:
         """Whose token or certificate a request has; None if nobody's that is known."""
         tls = scope.get("extensions", {}).get("tls", {})
         return self.authenticator.who(Headers(scope=scope).get("authorization"), tls.get("client_cert_name"))
-
-    @staticmethod
-    def _note(request: Request, name: str, roles: Sequence[Role]) -> None:
-        """Tell the handler and the audit log who asks for what only administrators may do."""
-        if set(roles) == {Role.ADMIN}:
-            setattr(request.state, ACTOR, name)

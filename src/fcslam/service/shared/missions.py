@@ -14,7 +14,7 @@ from typing import Final
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import InputError, StoreError
 from fcslam.mission.mission_store import MissionStore
-from fcslam.service.intake import AGENT_LEASE_S, Agents, Intake, SessionState, held_by_another
+from fcslam.service.intake import AGENT_LEASE_S, Agents, Intake, held_by_another
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, locked, sweep
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SharedDetectors, fetch_folder, fetched
@@ -22,7 +22,6 @@ from fcslam.service.shared.instance import Instance
 from fcslam.service.shared.mission_tables import Lease, MissionTables, insert_mission, schema_of
 from fcslam.service.shared.registry import KnownMission, Registry
 from fcslam.service.supervisor import Elsewhere, RunningWorker
-from fcslam.service.viewed_mission import PacketCounts
 from fcslam.storage.database import translate_errors
 from fcslam.storage.files import write_file
 from fcslam.storage.postgres import Postgres
@@ -126,16 +125,6 @@ class SharedMission(OpenMission):
     def result(self, name: str) -> Path | None:
         """As in ``OpenMission``."""
         return self._fetched(f"{RESULT}{name}", f"result-{name}")
-
-    def sessions(self, robot: str | None = None) -> list[SessionState]:
-        """Sessions of one robot or of all, by robot and epoch, whoever received their packets."""
-        self.intake.follow()
-        return super().sessions(robot)
-
-    def packet_counts(self) -> PacketCounts:
-        """How far the packets of all robots are."""
-        self.intake.follow()
-        return super().packet_counts()
 
     def close(self) -> None:
         """Nothing: the instance stops its worker."""
