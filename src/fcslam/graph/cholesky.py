@@ -4,6 +4,8 @@ Every sum has its order, no library of linear algebra takes part, and one thread
 same bytes.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,9 +25,15 @@ below the diagonal, ascending within a column, (B,).
 
 def find_structure(i: _Numbers, j: _Numbers, count: int) -> Structure:
     """Order ``count`` variables by minimum degree, for edges between two different variables each, shape (E,)."""
+    return _structure(i.tobytes(), j.tobytes(), count)
+
+
+@lru_cache(maxsize=2)  # most solves of a robust solution are on the edges of the solve before
+def _structure(of_i: bytes, of_j: bytes, count: int) -> Structure:
+    i, j = np.frombuffer(of_i, np.int64), np.frombuffer(of_j, np.int64)
     pairs = np.unique(np.concatenate((i * count + j, j * count + i)))
     first = np.searchsorted(pairs, np.arange(count + 1) * count)
-    row, start, degree, near = _eliminate(first[:-1].copy(), np.diff(first), pairs % count)
+    row, start, degree, near = _eliminate(first[:-1].copy(), np.diff(first), (pairs % count).astype(np.int32))
     below = near[np.arange(degree.sum()) + np.repeat(start - np.cumsum(degree) + degree, degree)]
     blocks = np.sort(np.repeat(row, degree) * count + row[below])
     low, high = np.minimum(row[i], row[j]), np.maximum(row[i], row[j])
@@ -113,7 +121,7 @@ def _eliminate(start, degree, near):  # type: ignore[no-untyped-def]
     its neighbours those that were left when it was eliminated.
     """
     count, end, number, least = len(start), len(near), 0, 0
-    row, left, seen = np.full(count, -1), np.arange(count), np.zeros(count, np.int64)
+    row, left, seen = np.full(count, -1), np.arange(count).astype(near.dtype), np.zeros(count, np.int64)
     joins = 0
     while number < count:
         kept, fewest = 0, count
@@ -125,10 +133,16 @@ def _eliminate(start, degree, near):  # type: ignore[no-untyped-def]
                 continue
             row[variable] = number
             number += 1
-            for p in range(start[variable], start[variable] + degree[variable]):
+            first, last = start[variable], start[variable] + degree[variable]
+            if degree[variable] == count - number:  # all others are its neighbours, and so will be each other's
+                for p in range(first, last):
+                    row[near[p]], start[near[p]], degree[near[p]] = number + p - first, p + 1, last - p - 1
+                number = count
+                break
+            for p in range(first, last):
                 other = near[p]
                 if end + degree[other] + degree[variable] > len(near):
-                    near = np.concatenate((near, np.empty(end + count, np.int64)))
+                    near = np.concatenate((near, np.empty(end + count, near.dtype)))
                 joins += 1
                 seen[variable] = seen[other] = joins
                 new = end
