@@ -248,7 +248,7 @@ def test_a_robots_own_closure_may_be_revoked_too(scripted):
     assert np.allclose(se2.between(result.robots[0].T_map_base, POSES), 0.0, atol=1e-3)
 
 
-@pytest.mark.parametrize("names", ["abcd", "acbd", "bdac", "dbca"])
+@pytest.mark.parametrize("names", ["abcd", "dbca"])
 def test_maps_of_several_robots_join_whoever_came_first(scripted, names):
     """Two pairs of robots join first, then the pairs: each map moves as a whole, into the older one's frame."""
     w, x, y, z = names

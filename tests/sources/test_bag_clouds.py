@@ -289,7 +289,7 @@ def leaning_bag(path, rotation_said, **leans):
     return save(path, messages)
 
 
-@pytest.mark.parametrize("leans", [{"pitch": 0.3}, {"roll": -0.5}, {"pitch": 0.1}], ids=str)
+@pytest.mark.parametrize("leans", [{"roll": -0.5}, {"pitch": 0.1}], ids=str)
 def test_a_sensor_that_leans_against_tf_is_levelled(tmp_path, leans):
     right = open_source(leaning_bag(tmp_path / "right.mcap", quaternion(YAW, **leans), **leans))
     wrong = open_source(leaning_bag(tmp_path / "wrong.mcap", quaternion(YAW), **leans))
