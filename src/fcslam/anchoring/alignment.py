@@ -34,8 +34,6 @@ LEAST_RIVAL_M: Final = 0.4 * LEAST_SURFACE_M
 """Score of an alignment elsewhere that is always assumed."""
 MOST_THICKNESS_M: Final = ON_SURFEL_M
 """Walls that differ in thickness by less on each side are drawn as lines of another width, or as one line."""
-DIRECTED: Final = 0.5
-"""Least length of the mean direction of walls, modulo a right angle, from which headings are chosen."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,10 +78,11 @@ class PlanAlignment:
 def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAlignment | None:
     """The best alignment of a whole map with a plan, conclusive or not; None if the map has no walls.
 
-    It is looked for from all positions, and by the directions of walls or all headings. A map that is ``placed`` lies
+    It is looked for from all positions, at headings that make walls parallel. A map that is ``placed`` lies
     about there in the plan already, and no other place is looked for.
     """
-    from fcslam.lidar.uniqueness import align_map, best_alignment, is_elsewhere  # SciPy's transforms take long to load
+    # SciPy's transforms take long to load.
+    from fcslam.lidar.uniqueness import align_map, best_alignment, is_elsewhere, parallel_headings
 
     target = plan.submap
     if not len(building.surface):
@@ -93,7 +92,7 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
         if is_elsewhere(best.T_a_b, np.zeros(3), building.surface.points.mean(axis=0, keepdims=True)):
             best = align_map(target, building, best.T_a_b)
     else:
-        found = best_alignment(target, building, LEAST_RIVAL_M, _headings(target, building))
+        found = best_alignment(target, building, LEAST_RIVAL_M, parallel_headings(target, building))
         if found is None:
             return None
         best, lead = found
@@ -107,19 +106,6 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
     surface_m = SPACING_M * min(of_plan.count, of_map.count)
     share = of_map.count / len(building.surface)
     return PlanAlignment(plan, best.T_a_b, of_plan.explained, of_plan.violation, surface_m, share, lead)
-
-
-def _headings(plan: Submap, building: Submap) -> FloatArray | None:
-    """Headings of the map over half a turn at which the walls of both are parallel, shape (2,), radians; None: walls of
-    no direction."""
-    directions = []
-    for submap in (plan, building):
-        normals = submap.surface.normals[np.any(submap.surface.normals != 0.0, axis=1)]
-        mean = complex(np.exp(4j * np.arctan2(normals[:, 1], normals[:, 0])).mean()) if len(normals) else 0j
-        if abs(mean) < DIRECTED:
-            return None
-        directions.append(float(np.angle(mean)) / 4.0)
-    return np.asarray(directions[0] - directions[1] + 0.5 * np.pi * np.arange(2), np.float64)
 
 
 def lengths_in_plan(plan: Submap, building: Submap, T_plan_map: FloatArray) -> tuple[float, float]:

@@ -149,14 +149,10 @@ class ClosureLog(Kept):
             and entry.closure.status is not ClosureStatus.CANDIDATE
         ]
 
-    def ties_at(self, place: KeyscanId) -> Iterator[ClosureEntry]:
-        """The accepted closures between this place and those of other robots."""
-        return filter(_is_accepted, self._at.get(place.robot, {}).get(place.number, ()))
-
     def tied(self, robot: str) -> list[int]:
-        """Numbers of the robot's keyscans with ``ties_at``, ascending."""
-        return sorted(number for number, entries in self._at.get(robot, {}).items() if any(map(_is_accepted, entries)))
-
-
-def _is_accepted(entry: ClosureEntry) -> bool:
-    return entry.closure.status is ClosureStatus.ACCEPTED
+        """Numbers of the robot's keyscans with accepted closures to other robots, ascending."""
+        return sorted(
+            number
+            for number, entries in self._at.get(robot, {}).items()
+            if any(entry.closure.status is ClosureStatus.ACCEPTED for entry in entries)
+        )

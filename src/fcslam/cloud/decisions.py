@@ -14,7 +14,7 @@ from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.edits import is_cut, is_removed, stamps_of
 from fcslam.cloud.joining import CONSISTENCY, decide_join, reevaluate
 from fcslam.cloud.joint_graph import AGREES_SIGMAS, SOLVED_SHARE, SURPRISE_M, SURPRISE_RAD, JointGraph
-from fcslam.cloud.map_comparison import MapComparison
+from fcslam.cloud.map_comparison import GROWTH, MapComparison
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.settings import FleetConfig
@@ -68,8 +68,9 @@ class ClosureDecisions(Kept):
         "maps": list[list[str]],
         "joins": dict[frozenset[str], ClusterEvidence],
         "version": int,
+        "_joins": bool,
         "_contested": bool,
-        "_postponed_until": int,
+        "_evaluated": int,
     }
 
     def __init__(self, config: FleetConfig, sessions: SessionStore, graph: JointGraph) -> None:
@@ -90,10 +91,12 @@ class ClosureDecisions(Kept):
         """How often the joint graph was solved."""
         self.changes: tuple[Change, ...] = ()
         """The changes by hand that are in force."""
+        self._joins = False
+        """Whether evidence is enough for a join."""
         self._contested = False
         """Whether evidence has turned against a join."""
-        self._postponed_until = 0
-        """Number of closures below which a contested join is not re-evaluated."""
+        self._evaluated = 0
+        """Number of closures at the last re-evaluation."""
 
     def map_of(self, session: str) -> list[str]:
         """The sessions that share a map with this one, itself included."""
@@ -127,11 +130,15 @@ class ClosureDecisions(Kept):
                 self._decide_pair(other, session)
 
     def optimize_if_due(self) -> None:
-        """Solve the joint graph if enough closures are new; re-evaluate if evidence turned against a join."""
+        """Solve the joint graph if enough closures are new; re-evaluate if evidence speaks for or against a join.
+
+        A re-evaluation takes as long as there are sessions, so robots that meet at the same time join together.
+        """
         # The graph of a robot alone is solved once, at the end.
         if len(self._sessions.robots) > 1 and self._graph.is_due(self._config.solve_every):
             self._optimize()
-        if self._contested and len(self.closures) >= self._postponed_until:
+        is_contested = self._contested and len(self.closures) >= int(CONTESTED_GROWTH * self._evaluated)
+        if is_contested or (self._joins and len(self.closures) >= self._evaluated + len(self._sessions.robots)):
             self.reevaluate()
 
     def edit(self, changes: Sequence[Change]) -> bool:
@@ -166,7 +173,7 @@ class ClosureDecisions(Kept):
         self.separated += _separated(self.maps, fusion.maps)
         self.maps, self.joins = [list(sessions) for sessions in fusion.maps], dict(fusion.joins)
         self._due.clear()
-        self._contested, self._postponed_until = False, int(CONTESTED_GROWTH * len(self.closures))
+        self._joins, self._contested, self._evaluated = False, False, len(self.closures)
         self.version += 1
         return fusion
 
@@ -244,18 +251,17 @@ class ClosureDecisions(Kept):
 
     def _decide_pair(self, a: str, b: str) -> None:
         entries, pair = self.closures.evidence(a, b), frozenset((a, b))
-        if len(entries) < self._due.get(pair, 0):
-            return
+        if self._joins or len(entries) < self._due.get(pair, 0):
+            return  # the re-evaluation to come decides every pair
         decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self.comparison.fit)
         if b in self.map_of(a):
             self._contested |= self._is_contested(decision, entries)
         if decision.shortfall is not None:
-            growth = DECIDED_GROWTH if len(entries) > DECIDED_EACH_TIME else 1.0
-            self._due[pair] = int(growth * len(entries)) + 1
             _explain(entries, decision.shortfall.under(CONSISTENCY))
-        elif any(entries[k].closure.status is not ClosureStatus.ACCEPTED for k in decision.members):
-            self.reevaluate()
-            self._due[pair] = int(CONTESTED_GROWTH * len(entries)) + 1
+        else:
+            self._joins |= any(entries[k].closure.status is not ClosureStatus.ACCEPTED for k in decision.members)
+        growth = DECIDED_GROWTH if len(entries) > DECIDED_EACH_TIME else 1.0
+        self._due[pair] = int(growth * len(entries)) + 1
 
     def _accept(self, entry: ClosureEntry, reason: Reason) -> None:
         closure = entry.closure
@@ -266,19 +272,23 @@ class ClosureDecisions(Kept):
 
     def _optimize(self) -> None:
         self._graph.optimize()
-        self._contested |= any(map(self._is_refuted, self.joins))
+        self._contested |= self._are_maps_refuted()
         self.version += 1
 
-    def _is_refuted(self, pair: frozenset[str]) -> bool:
-        """Whether the maps of two joined sessions have grown since they were compared, and now contradict."""
-        a, b = sorted(pair, key=self._sessions.robots.index)
-        if not self.comparison.is_outdated(pair, sum(len(self._graph.path(session)) for session in pair)):
+    def _are_maps_refuted(self) -> bool:
+        """Whether the maps of two joined sessions contradict each other by now: of those that have grown most.
+
+        One pair after each solve: all of them would delay the packets that wait.
+        """
+        growth = {
+            pair: self.comparison.growth(pair, sum(len(self._graph.trajectory(session)) for session in pair))
+            for pair in self.joins
+        }
+        pair = max(growth, key=growth.__getitem__, default=frozenset[str]())
+        if growth.get(pair, 0.0) < GROWTH * GROWTH:
             return False
-        entries = self.closures.evidence(a, b)
-        decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self.comparison.fit)
-        if decision.dominant:
-            self.joins[pair] = decision.evidence
-        return self._is_contested(decision, entries)
+        a, b = sorted(pair, key=self._sessions.robots.index)
+        return not self.comparison.agree_still((a, b), self._graph.trajectory(a), self._graph.trajectory(b))
 
     def _is_contested(self, decision: ClusterDecision, entries: Sequence[ClosureEntry]) -> bool:
         """Whether a decision speaks against a join: it has no dominant cluster, or most of that lies elsewhere."""

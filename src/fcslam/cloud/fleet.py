@@ -26,7 +26,6 @@ from fcslam.cloud.tags import SeenTags
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
-from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
     Change,
     Constraint,
@@ -305,12 +304,12 @@ class Fleet:
 
     def _add_place(self, place: Place) -> None:
         session, decisions = place.id.robot, self._decisions
-        matches: list[PlaceMatch] = []
-        if self._config.join_maps and self._sessions.hold(place):
-            matches = self._recognition.match(place, decisions.map_of(session))
-            decisions.add_matches(matches, session)
-            self._recognition.thin(place, decisions.map_of(session))
+        is_compared = self._config.join_maps and self._sessions.hold(place)
+        matches = self._recognition.match(place, decisions.map_of(session)) if is_compared else []
+        decisions.add_matches(matches, session)
         self._optimize_if_due()
+        if is_compared:
+            self._recognition.thin(place, decisions.map_of(session))
         self._quality.update(place, matches, decisions.map_of(session))
 
     def _optimize_if_due(self) -> None:

@@ -29,7 +29,8 @@ MOST_KEYSCANS = 150
 
 GROWTH = 1.5
 """The maps of two sessions are compared again when their cluster, or their paths together, have grown by this factor:
-at each place, it would take longer than all else."""
+at each place, it would take longer than all else. Maps that agreed are compared again when the paths have grown by this
+factor twice."""
 MOST_TRANSFORMS = 5
 """Comparisons of two sessions that are kept, at different transforms."""
 
@@ -63,6 +64,10 @@ class _Compared:
     """Number of keyscans of both sessions."""
     fit: MapFit
 
+    @property
+    def agrees(self) -> bool:
+        return self.fit.is_compared and refutation(self.fit) is None
+
     def reversed(self) -> "_Compared":
         return replace(self, i=self.j, j=self.i, T_i_j=frozen(se2.inverse(self.T_i_j)))
 
@@ -84,11 +89,13 @@ class MapComparison(Kept):
 
         The closures from a to b, at least one, give the transform. Returns None if a session has no keyscan left around
         the places. An earlier comparison at the same transform counts until the cluster or the paths have grown by a
-        factor, and for good if keyscans were released since.
+        factor, if the maps agreed until the paths have, and for good if keyscans were released since.
         """
         pair = frozenset(sessions)
         T_a_b, size = relative_frame(a, b, members), len(a) + len(b)
         earlier = [each for each in self._compared.get(pair, ()) if self._is_at(each, sessions, a, b, T_a_b)]
+        if earlier and earlier[0].agrees and size < growth * growth * earlier[0].size:
+            return earlier[0].fit
         if earlier and len(members) < growth * earlier[0].closures and size < growth * earlier[0].size:
             return earlier[0].fit
         found = self._compare(sessions, a, b, members, T_a_b, earlier)
@@ -97,10 +104,15 @@ class MapComparison(Kept):
             self._compared[pair] = [found, *others[: MOST_TRANSFORMS - 1]]
         return None if found is None else found.fit
 
-    def is_outdated(self, sessions: frozenset[str], size: int) -> bool:
-        """Whether the paths of two sessions, ``size`` keyscans together, have grown since their maps were compared."""
-        compared = self._compared.get(sessions, [])
-        return bool(compared) and size >= GROWTH * min(each.size for each in compared)
+    def growth(self, sessions: frozenset[str], size: int) -> float:
+        """By which factor the paths of two sessions, ``size`` keyscans together, have grown since their maps agreed."""
+        return size / min((each.size for each in self._compared.get(sessions, ()) if each.agrees), default=size)
+
+    def agree_still(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> bool:
+        """Whether maps that agreed do so at the poses (N, 3) of a joint map, after the paths have grown."""
+        fit, pair, size = self.at(sessions, poses_a, poses_b), frozenset(sessions), len(poses_a) + len(poses_b)
+        self._compared[pair] = [replace(each, size=size) if each.agrees else each for each in self._compared[pair]]
+        return not fit.is_compared or refutation(fit) is None
 
     @staticmethod
     def _is_at(
@@ -122,7 +134,7 @@ class MapComparison(Kept):
         earlier: "list[_Compared]",
     ) -> "_Compared | None":
         # SciPy's transforms take as long to load as a hundred scans, and most missions compare no maps.
-        from fcslam.lidar.uniqueness import align_map, alignments
+        from fcslam.lidar.uniqueness import align_map, alignments, parallel_headings
 
         local_maps = _LocalMaps(self._sessions, sessions, (a.poses, b.poses))
         near_a, i, is_complete_a = local_maps.around(0, a.poses[members.i, :2].mean(axis=0))
@@ -140,7 +152,8 @@ class MapComparison(Kept):
             whole_b = build_submap(local_maps.scans(1, near_b, j.number), REACH_M)
             best = align_map(whole_a, whole_b, T_i_j)
             fit = replace(fit, seen_m=best.known_m)
-            for rival in alignments(whole_a, whole_b, best.T_a_b)[:RIVALS]:
+            found_elsewhere = alignments(whole_a, whole_b, best.T_a_b, parallel_headings(whole_a, whole_b))
+            for rival in (each for each in found_elsewhere[:RIVALS] if each.score_m > 0.0):
                 T = se2.compose(se2.compose(T_a_i, rival.T_a_b), se2.inverse(T_b_j))
                 found = local_maps.agreement(np.broadcast_to(T, b.poses.shape))
                 if found.support > fit.rival_support and refutation(_fit(found)) is None:

@@ -1,8 +1,7 @@
 """Place recognition of the fleet: which stored places may a new one show again, and which are kept."""
 
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from operator import attrgetter, itemgetter
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -40,15 +39,9 @@ _VocabularyKey = tuple[Channel, str, str]
 SIGHT_M = 6.0
 """Largest distance at which places in the same map are compared."""
 NEAR_VISITS = 2
-"""Earlier visits of each robot that are compared with a new place; of robots that closures nearby tie together, two
-count."""
-TIED_CLOSURES = 3
-"""Closures near a place after which the relative pose of two groups of robots is well determined there: together they
-are more certain than one more closure, which therefore adds little."""
-COMPARED_ROBOTS = 2
-"""Number of robots of a group that a new place is compared with, if each was here often enough."""
-NEWEST_PLACES = 12
-"""Newest places of a robot near a point whose closures are counted."""
+"""Earlier visits of each robot that may be compared with a new place."""
+COMPARED_VISITS = 3
+"""Earlier visits of all robots that are compared with a new place: the work does not grow with the fleet."""
 _NO_PLACES = np.empty((0, 2), np.int64)
 
 
@@ -58,7 +51,6 @@ class Visit(NamedTuple):
     distance_m: float
     """Distance of the nearest one."""
     nearest: KeyscanId
-    places: tuple[KeyscanId, ...]
 
 
 class PlaceRecognition:
@@ -184,7 +176,7 @@ class PlaceRecognition:
         self._sessions.release(place)
 
     def _predicted(self, place: Place, map_sessions: Collection[str]) -> dict[KeyscanId, FloatArray]:
-        """T_i_j (3,) to the nearest places of other sessions in the map: one for each visit, few for each group."""
+        """T_i_j (3,) to the nearest places of other sessions in the map, one for each visit."""
         pose, key = self._graph.pose(place.id), self._key(place)
         visits: dict[str, list[Visit]] = {}
         for session in map_sessions:
@@ -195,7 +187,7 @@ class PlaceRecognition:
             found = visits_near(session, numbers, poses, pose[:2], SIGHT_M)
             if found:
                 visits.setdefault(robot_of(session), []).extend(found)
-        chosen = worth_comparing(visits, self._closures_near(visits), NEAR_VISITS)
+        chosen = worth_comparing(visits.values(), NEAR_VISITS, COMPARED_VISITS)
         return {visit.nearest: se2.between(self._graph.pose(visit.nearest), pose) for visit in chosen}
 
     def _by_start(self, place: Place, map_sessions: Collection[str]) -> Iterator[PlaceMatch]:
@@ -228,18 +220,6 @@ class PlaceRecognition:
         poses = self._graph.trajectory(session)
         return se2.between(poses[0], poses[numbers])
 
-    def _closures_near(self, visits: Mapping[str, Sequence[Visit]]) -> Counter[frozenset[str]]:
-        """Number of accepted closures at the newest places of each robot's visits, by pair of robots."""
-        near = (
-            place
-            for found in visits.values()
-            for place in [place for visit in found for place in visit.places][-NEWEST_PLACES:]
-        )
-        entries = {entry for place in near for entry in self._closures.ties_at(place)}
-        return Counter(
-            frozenset((robot_of(entry.closure.i.robot), robot_of(entry.closure.j.robot))) for entry in entries
-        )
-
 
 def visits_near(
     session: str, numbers: NDArray[np.int64], T_map_place: FloatArray, xy: FloatArray, within_m: float
@@ -254,33 +234,17 @@ def visits_near(
     stays = np.split(close, np.flatnonzero(np.diff(close) > 1) + 1) if len(close) else []
     visits = []
     for stay in stays:
-        nearest = int(np.argmin(distance[stay]))
-        places = tuple(KeyscanId(session, number) for number in numbers[stay].tolist())
-        visits.append(Visit(float(distance[stay[nearest]]), places[nearest], places))
+        nearest = stay[np.argmin(distance[stay])]
+        visits.append(Visit(float(distance[nearest]), KeyscanId(session, int(numbers[nearest]))))
     return visits
 
 
-def worth_comparing(visits: Mapping[str, Sequence[Visit]], closures: Counter[frozenset[str]], most: int) -> list[Visit]:
-    """The visits that a new place is compared with.
+def worth_comparing(visits: Iterable[Sequence[Visit]], of_each: int, most: int) -> list[Visit]:
+    """The visits of each robot that a new place is compared with: the nearest ones of different robots first.
 
-    Robots that closures tie together here are a group. Closures to two robots of a group determine the pose relative to
-    all of it, so the number of comparisons does not grow with the number of robots that were here. Within a group, the
-    nearest visits of different robots come first. ``closures`` counts the accepted ones near the new place, by pair of
-    robots; ``most`` visits of each robot are taken.
+    ``of_each`` robot and ``most`` in all are taken. Closures to a few robots determine the pose relative to all others
+    that closures tie to them.
     """
-    nearest = {robot: sorted(found, key=attrgetter("distance_m"))[:most] for robot, found in visits.items()}
-    chosen: list[Visit] = []
-    for group in _tied_groups(visits, closures):
-        ranked = [(rank, visit.distance_m, visit) for robot in group for rank, visit in enumerate(nearest[robot])]
-        ranked.sort(key=itemgetter(0, 1))
-        chosen += [visit for _, _, visit in ranked[: COMPARED_ROBOTS * most]]
-    return chosen
-
-
-def _tied_groups(robots: Iterable[str], closures: Counter[frozenset[str]]) -> list[list[str]]:
-    groups: list[list[str]] = []
-    for robot in robots:
-        tied = [g for g in groups if sum(closures[frozenset((robot, other))] for other in g) >= TIED_CLOSURES]
-        groups = [group for group in groups if group not in tied]
-        groups.append([*(member for group in tied for member in group), robot])
-    return groups
+    nearest = (sorted(found, key=attrgetter("distance_m"))[:of_each] for found in visits)
+    ranked = sorted((rank, visit) for found in nearest for rank, visit in enumerate(found))
+    return [visit for _, visit in ranked[:most]]

@@ -5,8 +5,7 @@ the robots' frames are unknown. Pairwise consistency finds these transforms; gra
 closure.
 """
 
-import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,6 +39,9 @@ shape (N, 3) each."""
 
 _Relation = tuple[int, int, FloatArray]
 """Two robots a and b, and the transform T_a_b between their own frames, shape (3,)."""
+
+PREDICTED_M, PREDICTED_RAD = 1.0, 0.26
+"""Largest median difference between a cluster and the transform that other links predict."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,8 +78,8 @@ class Link:
     """Its members are indices into ``edges``."""
     closures: Closures
     """The same K closures, from a to b."""
-    T_a_b: FloatArray | None
-    """Transform between the robots' own frames, shape (3,); None if no cluster is dominant."""
+    T_a_b: FloatArray
+    """Transform between the robots' own frames by the largest cluster, shape (3,)."""
 
     @property
     def members(self) -> NDArray[np.int64]:
@@ -98,7 +100,7 @@ class JointSolution:
     links: tuple[Link, ...]
     """One for every two robots with independent closures between them."""
     joining: tuple[Link, ...]
-    """Those that join maps."""
+    """Those with a dominant cluster. Where other links predict it, the maps of these robots were not compared."""
     own: tuple[FloatArray, ...]
     """Poses of each robot from its own measurements alone, shape (N_k, 3); the first stays where the graph has it."""
     apart: Mapping[tuple[int, int], Reason]
@@ -132,16 +134,29 @@ def solve_jointly(
     initial = evidence.graph.poses()
     own = [_solve_own_graph(evidence, robot, initial[robot]) for robot in evidence.robots]
     paths = [path for path, _ in own]
-    # 2. Find the dominant cluster of closures between every two robots (PCM).
-    links = _find_links(evidence, paths, consistency, examine)
-    joining = [link for link in links if link.decision.dominant]
+    # 2. Find the largest cluster of closures between every two robots (PCM).
+    independent = _pairs(evidence, evidence.independent & ~evidence.excluded)
+    pairs = {(a, b): (rows, closures) for a, b, rows, closures in independent}
+
+    def link(a: int, b: int, examine: ExaminePair = lambda *_: None) -> Link:
+        return _find_link(evidence, (a, b), (paths[a], paths[b]), *pairs[a, b], consistency, examine)
+
+    links, compared = {pair: link(*pair) for pair in pairs}, dict[tuple[int, int], Link]()
+
+    def compare_maps(found: Link) -> Link:
+        pair = found.a, found.b
+        if len(found.members) >= consistency.minimum_closures and pair not in compared:
+            compared[pair] = link(*pair, examine)
+        return compared.get(pair, found)
+
     known = _known_transforms(evidence, paths)
-    _, bound = _merge_frames(len(own), known, ())
+    _, bound, _ = _merge_frames(paths, known, (), compare_maps)
     apart: dict[tuple[int, int], Reason] = {}
+    left = links
     senders = evidence.senders or range(len(own))
     while True:
-        # 3. Merge the robots' frames along the strongest links.
-        frames, maps = _merge_frames(len(own), known, joining)
+        # 3. Merge the robots' frames along the strongest links, if the maps agree.
+        frames, maps, joining = _merge_frames(paths, known, left.values(), compare_maps)
         within_maps = _edges_within_maps(evidence, maps)
         # 4. Solve with the supported closures, then decide all closures within maps by that solution.
         supported = within_maps & _supported_edges(evidence, [inliers for _, inliers in own], joining)
@@ -153,18 +168,21 @@ def solve_jointly(
             trusted = replace(solution, weights=solution.weights * ~isolated)
             solution = _refine_inliers(evidence.graph, within_maps, trusted)
         # 6. Repeat without the links that the joint solution contradicts.
-        confirmed = [link for link in joining if is_confirmed(link, paths, solution, evidence.informative, consistency)]
+        false = {
+            (link.a, link.b)
+            for link in joining
+            if not is_confirmed(link, paths, solution, evidence.informative, consistency)
+        }
         # 7. Robots that alone join maps that contradict each other leave them.
-        if len(confirmed) == len(joining):
+        if not false:
             bridges = _false_bridges(evidence, solution, senders, compare)
             apart |= {(a, b): reason for (a, b), reason in bridges.items() if bound[a] != bound[b]}
-            confirmed = [link for link in confirmed if (link.a, link.b) not in apart]
-        if len(confirmed) == len(joining):
+            false = {(link.a, link.b) for link in joining} & apart.keys()
+        if not false:
             own_poses: tuple[FloatArray, ...] = tuple(frozen(path.poses) for path in paths)
-            return JointSolution(
-                solution.poses, solution.weights, tuple(maps), tuple(links), tuple(joining), own_poses, apart
-            )
-        joining = confirmed
+            found = tuple((links | compared).values())
+            return JointSolution(solution.poses, solution.weights, tuple(maps), found, tuple(joining), own_poses, apart)
+        left = {pair: link for pair, link in left.items() if pair not in false}
 
 
 def _solve_own_graph(
@@ -183,19 +201,21 @@ def _solve_own_graph(
     return robot_trajectory(own_graph, solution.poses), mine[solution.weights > INLIER_WEIGHT]
 
 
-def _find_links(
-    evidence: JointEvidence, own: Sequence[Trajectory], settings: ConsistencySettings, examine: ExaminePair
-) -> list[Link]:
-    def link(a: int, b: int, rows: NDArray[np.int64], closures: Closures) -> Link:
-        def examine_members(members: NDArray[np.int64]) -> MapFit | None:
-            return examine(a, b, own[a], own[b], closures.select(members))
+def _find_link(
+    evidence: JointEvidence,
+    robots: tuple[int, int],
+    own: tuple[Trajectory, Trajectory],
+    edges: NDArray[np.int64],
+    closures: Closures,
+    settings: ConsistencySettings,
+    examine: ExaminePair,
+) -> Link:
+    def examine_members(members: NDArray[np.int64]) -> MapFit | None:
+        return examine(*robots, *own, closures.select(members))
 
-        decision = decide_cluster(own[a], own[b], closures, evidence.informative[rows], settings, examine_members)
-        members = closures.select(np.array(decision.members, dtype=np.int64))
-        T_a_b = relative_frame(own[a], own[b], members) if decision.dominant else None
-        return Link(a, b, rows, decision, closures, T_a_b)
-
-    return [link(*pair) for pair in _pairs(evidence, evidence.independent & ~evidence.excluded)]
+    decision = decide_cluster(*own, closures, evidence.informative[edges], settings, examine_members)
+    members = closures.select(np.array(decision.members, dtype=np.int64))
+    return Link(*robots, edges, decision, closures, relative_frame(*own, members))
 
 
 def _pairs(
@@ -225,26 +245,43 @@ def _known_transforms(evidence: JointEvidence, own: Sequence[Trajectory]) -> lis
     return relations
 
 
-def _merge_frames(count: int, known: Sequence[_Relation], links: Sequence[Link]) -> tuple[list[FloatArray], list[int]]:
-    """``T_map_own`` of every robot and the number of its map: a spanning tree that takes what is known first, then the
-    strongest links."""
-    frames = [np.zeros(3) for _ in range(count)]
-    maps = list(range(count))
-    strongest = sorted(
-        links, key=lambda link: (-link.decision.evidence.separate_places, -len(link.decision.members), link.a, link.b)
-    )
-    found = ((link.a, link.b, link.T_a_b) for link in strongest if link.T_a_b is not None)
-    for a, b, T_a_b in itertools.chain(known, found):
+def _merge_frames(
+    own: Sequence[Trajectory], known: Sequence[_Relation], links: Iterable[Link], compare_maps: Callable[[Link], Link]
+) -> tuple[list[FloatArray], list[int], list[Link]]:
+    """``T_map_own`` of every robot, the number of its map, and the links that join: a spanning tree that takes what is
+    known first, then the strongest links.
+
+    To compare maps takes longest. Of robots in one map already, only those are compared whose link lies elsewhere.
+    """
+    frames, maps = [np.zeros(3) for _ in own], list(range(len(own)))
+    joining: list[Link] = []
+
+    def merge(a: int, b: int, T_a_b: FloatArray) -> None:
         older, younger = sorted((maps[a], maps[b]))
         if older == younger:
-            continue
+            return
         # T_mapA_mapB, through the two robots
         T = se2.compose(se2.compose(frames[a], T_a_b), se2.inverse(frames[b]))
         T = T if maps[a] == older else se2.inverse(T)
-        for robot in (robot for robot in range(count) if maps[robot] == younger):
+        for robot in (robot for robot, number in enumerate(maps) if number == younger):
             frames[robot], maps[robot] = se2.compose(T, frames[robot]), older
+
+    def is_predicted(link: Link) -> bool:
+        members = link.closures.select(np.array(link.decision.members, dtype=np.int64))
+        T_map_i = se2.compose(frames[link.a], own[link.a].poses[members.i])
+        T_map_j = se2.compose(frames[link.b], own[link.b].poses[members.j])
+        x, y, theta = np.median(np.abs(se2.between(se2.between(T_map_i, T_map_j), members.T_i_j)), axis=0)
+        return bool(np.hypot(x, y) <= PREDICTED_M and theta <= PREDICTED_RAD)
+
+    for relation in known:
+        merge(*relation)
+    for link in sorted(links, key=lambda link: (-link.decision.evidence.separate_places, -len(link.members))):
+        found = link if maps[link.a] == maps[link.b] and is_predicted(link) else compare_maps(link)
+        if found.decision.dominant:
+            joining.append(found)
+            merge(found.a, found.b, found.T_a_b)
     order = {first: number for number, first in enumerate(dict.fromkeys(maps))}
-    return frames, [order[first] for first in maps]
+    return frames, [order[first] for first in maps], joining
 
 
 def _edges_within_maps(evidence: JointEvidence, maps: Sequence[int]) -> NDArray[np.bool_]:
@@ -276,19 +313,20 @@ def _solve_supported(
 ) -> Solution:
     """Graduated non-convexity with supported closures only, so that false ones cannot distort its start.
 
-    It starts from the robots' own solutions and, if robots are ``joined``, from the chordal initialization as well,
-    which does not depend on drift; the cheaper result counts. A robot's own solution is already the best of several
-    starts. Other closures have weight 0.
+    It starts from the robots' own solutions. If robots are ``joined`` and not every closure holds, it starts from the
+    chordal initialization as well, which does not depend on drift; the cheaper result counts. A robot's own solution is
+    already the best of several starts. Other closures have weight 0.
     """
     graph = evidence.graph
     start = graph.poses()
     for robot, path, frame in zip(evidence.robots, own, frames, strict=True):
         start[robot] = se2.compose(frame, path.poses)
     subgraph = graph.restricted(start, supported)
-    starts = (start, initialize(subgraph)) if joined else (start,)
-    solutions = [optimize_gnc(subgraph, poses) for poses in starts]
-    best = min(solutions, key=lambda solution: solution.cost)
-    return _expand_weights(best, supported)
+    solution = optimize_gnc(subgraph, start)
+    if joined and not solution.weights.all():
+        other = optimize_gnc(subgraph, initialize(subgraph))
+        solution = min(solution, other, key=lambda solution: solution.cost)
+    return _expand_weights(solution, supported)
 
 
 def _refine_inliers(graph: PoseGraph, within_maps: NDArray[np.bool_], trusted: Solution) -> Solution:

@@ -16,7 +16,8 @@ _UNMEASURED_VARIANCE = 1e6
 def solve_single_robot(graph: PoseGraph) -> Solution:
     """Optimize the graph of one robot robustly; its variables are in the order of its path.
 
-    Returns the cheapest of three solutions; the value of the truncated loss, which has many minima, ranks them:
+    Returns the first of three solutions in which every closure holds, or the cheapest. The value of the truncated loss,
+    which has many minima, ranks them:
 
     - Odometry decides which closures are inliers. Correct while odometry has drifted less than closures are uncertain.
     - Graduated non-convexity with every closure, from odometry. Correct while false closures are few, or small.
@@ -33,7 +34,7 @@ def solve_single_robot(graph: PoseGraph) -> Solution:
     robust = graph.arrays().robust
     odometry = initialize(graph, (~robust).astype(float))
     by_odometry = refine_inliers(graph, odometry, ~robust)
-    if not robust.any():
+    if by_odometry.weights.all():
         return by_odometry
     supported = ~robust
     edges = graph.arrays()

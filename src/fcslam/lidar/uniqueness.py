@@ -34,6 +34,10 @@ PEAKS = 3
 """Best positions that are kept for each heading."""
 REFINED = 4 * PEAKS
 """Best distinct transforms that are refined and scored exactly."""
+PARALLEL_SHARE = 0.5
+"""Headings at which at least this share of the most walls are parallel are searched where two maps are alike."""
+DIRECTION_DEG = 2.5
+"""Standard deviation of the directions of parallel walls."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +112,23 @@ def best_alignment(
     best, middle = found[0], b.surface.points.mean(axis=0, keepdims=True)
     rivals_m = (each.score_m for each in found if is_elsewhere(each.T_a_b, best.T_a_b, middle))
     return best, best.score_m / max(least_rival_m, next(rivals_m, 0.0))
+
+
+def parallel_headings(a: Submap, b: Submap) -> FloatArray:
+    """Headings of b in a over half a turn at which many walls of both are parallel, modulo a right angle, shape (H,).
+
+    A tenth of all headings in most buildings. Elsewhere no map lies like another one of the same building.
+    """
+    directions = []
+    for normals in (a.surface.normals, b.surface.normals):
+        turn = np.arctan2(normals[:, 1], normals[:, 0])[np.any(normals != 0.0, axis=1)]
+        directions.append(fft.rfft(np.bincount(np.rint(np.degrees(turn)).astype(np.int64) % 90, minlength=90)))
+    blur = np.exp(-2.0 * (np.pi * DIRECTION_DEG * np.arange(46) / 90.0) ** 2)
+    parallel = fft.irfft(directions[0] * np.conj(directions[1]) * blur, 90)
+    headings = _half_headings(b.surface.points - b.surface.points.mean(axis=0))
+    share = parallel[np.rint(np.degrees(headings)).astype(np.int64) % 90]
+    chosen: FloatArray = headings[share >= PARALLEL_SHARE * share.max()]
+    return chosen
 
 
 def is_elsewhere(one: FloatArray, other: FloatArray, middle: FloatArray) -> bool:

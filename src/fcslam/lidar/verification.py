@@ -202,12 +202,12 @@ def _asymmetry(gap: FloatArray) -> Reason | None:
 def _shortfall(found: Agreement, gate: Gate, noise: Callable[[], float]) -> Reason | None:
     if found.explained < gate.explained:
         return Reason(ReasonCode.NOT_ENOUGH_EXPLAINED, found.explained, gate.explained)
-    if found.violation > gate.violation and found.violation > (limit := _noisy_limit(found, gate, noise)):
-        return Reason(ReasonCode.IN_FREE_SPACE, found.violation, limit)
     if found.count < gate.count:
         return Reason(ReasonCode.FEW_POINTS, found.count, gate.count)
     if found.overlap < gate.overlap:
         return Reason(ReasonCode.LITTLE_OVERLAP, found.overlap, gate.overlap)
+    if found.violation > gate.violation and found.violation > (limit := _noisy_limit(found, gate, noise)):
+        return Reason(ReasonCode.IN_FREE_SPACE, found.violation, limit)
     return None
 
 
