@@ -157,7 +157,8 @@ def _compare(
     rows, columns = picture.shape
     outside = rows * columns
     levels = np.zeros(outside + 1, np.uint8)  # the last one is that of the points outside
-    levels[:outside] = picture.ravel()
+    for cell, level in enumerate(picture.flat):  # numba compiles an assignment of arrays for seconds
+        levels[cell] = level
     cells = np.empty((2, pattern.shape[1]), np.int32)
     darker = np.empty((pixels.shape[0], pattern.shape[1]), np.bool_)
     for index in range(pixels.shape[0]):
