@@ -253,7 +253,8 @@ class ClosureDecisions(Kept):
         entries, pair = self.closures.evidence(a, b), frozenset((a, b))
         if self._joins or len(entries) < self._due.get(pair, 0):
             return  # the re-evaluation to come decides every pair
-        decision = decide_join(entries, (a, b), self._graph, self._config.consistency, self.comparison.fit)
+        robots = (a, b) if self._sessions.robots.index(a) < self._sessions.robots.index(b) else (b, a)
+        decision = decide_join(entries, robots, self._graph, self._config.consistency, self.comparison.fit)
         if b in self.map_of(a):
             self._contested |= self._is_contested(decision, entries)
         if decision.shortfall is not None:

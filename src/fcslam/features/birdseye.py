@@ -157,8 +157,7 @@ def _compare(
     rows, columns = picture.shape
     outside = rows * columns
     levels = np.zeros(outside + 1, np.uint8)  # the last one is that of the points outside
-    for cell, level in enumerate(picture.flat):  # numba compiles an assignment of arrays for seconds
-        levels[cell] = level
+    levels[:outside] = picture.ravel()
     cells = np.empty((2, pattern.shape[1]), np.int32)
     darker = np.empty((pixels.shape[0], pattern.shape[1]), np.bool_)
     for index in range(pixels.shape[0]):

@@ -39,6 +39,9 @@ MOST_CLUSTERS = 4
 DIRECTION_M = 1.0
 """Least distance between two matched points that fixes a rotation: each point is known to a few centimetres."""
 
+FARTHEST_M = 20.0
+"""A closure gives the transform between two maps up to this far along the path: beyond, drift counts."""
+
 _SEPARATE_BUDGET = NODE_BUDGET // 100
 """Branches searched for the largest set of separate places; beyond them the result is a lower bound."""
 _MEAN_ROUNDS = 10
@@ -116,6 +119,24 @@ def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArr
     if min(distance[k, m], np.hypot(*(in_a[k] - in_a[m]))) < DIRECTION_M:
         return se2.compose(T_a_j[0], se2.inverse(b.poses[closures.j[0]]))
     return two_point_alignment(in_a[[k, m]], in_b[[k, m]])
+
+
+def local_frames(a: Trajectory, b: Trajectory, members: Closures) -> FloatArray:
+    """T_a_b (N, 3) at each of the N keyscans of b by the closure that is nearest along b's path, without drift.
+
+    NaN farther than ``FARTHEST_M`` of path from any closure. Tags fix the heading worse than walls, so they count only
+    without other closures, and then all together.
+    """
+    walls = np.flatnonzero(members.tags == 0) if len(members.tags) else np.arange(len(members))
+    if not len(walls):
+        return np.broadcast_to(relative_frame(a, b, members), b.poses.shape)
+    members = members.select(walls)
+    distance_m = np.abs(b.travel_m[:, None] - b.travel_m[members.j][None])
+    nearest = np.argmin(distance_m, axis=1)
+    T_a_b = se2.compose(se2.compose(a.poses[members.i], members.T_i_j), se2.inverse(b.poses[members.j]))
+    T: FloatArray = T_a_b[nearest]
+    T[distance_m.min(axis=1) > FARTHEST_M] = np.nan
+    return T
 
 
 def _mean_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:

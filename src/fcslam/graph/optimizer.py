@@ -71,8 +71,9 @@ def optimize_gnc(
 
     Graduated non-convexity (Yang et al., RA-L 2020, truncated least squares, eqs. 12-14); odometry always counts.
 
-    Each step is one iteration from the poses of the step before. This need not find the best set: the drift of the
-    odometry may favour a false loop (``benchmarks/robust_graph.py``, m3500 with 100 random false loops).
+    Each step is one iteration from the poses of the step before. To solve every step to convergence decides as well in
+    ten times the time (``benchmarks/robust_graph.py``, m3500 with 100 random false loops). Neither is sure to find the
+    best set: the drift of the odometry may favour a false loop.
 
     ``initial`` is odometry or better. Arguments and result as of ``optimize``.
     """

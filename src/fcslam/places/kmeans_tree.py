@@ -144,16 +144,12 @@ def grow_tree(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
             found, labels = k_means(codes[members[low:high]], shape, state)
             if found.shape[0] > 1:
                 families[vertex, 0], families[vertex, 1] = used, found.shape[0]
-                first, before, sizes = used, members[low:high].copy(), np.bincount(labels, minlength=found.shape[0])
-                for child in range(found.shape[0]):
-                    _copy(found, child, centres, used)
-                    level[used], begin[used], end[used] = level[vertex] + 1, low, low
-                    low += sizes[child]
-                    used += 1
-                for k in range(before.shape[0]):
-                    child = first + labels[k]
-                    members[end[child]] = before[k]
-                    end[child] += 1
+                members[low:high] = members[low:high][np.argsort(labels, kind="mergesort")]
+                bounds = low + np.cumsum(np.bincount(labels, minlength=found.shape[0]))
+                children = slice(used, used + found.shape[0])
+                centres[children], level[children], end[children] = found, level[vertex] + 1, bounds
+                begin[used], begin[used + 1 : used + found.shape[0]] = low, bounds[:-1]
+                used += found.shape[0]
         vertex += 1
     return Tree(centres[:used].copy(), families[:used].copy())
 
@@ -175,13 +171,6 @@ def k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tu
     _assign(codes, centres, labels)
     sizes = np.bincount(labels, minlength=centres.shape[0])
     return centres[sizes > 0], (np.cumsum(sizes > 0) - 1)[labels]
-
-
-@njit
-def _copy(codes: CodeWords, k: int, centres: CodeWords, vertex: int) -> None:
-    """Copy code k word by word: numba compiles an assignment of arrays for seconds."""
-    for word in range(CODE_WORDS):
-        centres[vertex, word] = codes[k, word]
 
 
 @njit
@@ -217,7 +206,7 @@ def _assign(codes: CodeWords, centres: CodeWords, labels: NDArray[np.int64]) -> 
 def _seed_centres(codes: CodeWords, branching: int, state: NDArray[np.uint64]) -> CodeWords:
     """k-means++ (Arthur and Vassilvitskii 2007): draw each next centre by its squared distance to those so far."""
     centres = np.empty((branching, CODE_WORDS), np.uint64)
-    _copy(codes, int(_uniform(state) * codes.shape[0]), centres, 0)
+    centres[0] = codes[int(_uniform(state) * codes.shape[0])]
     nearest = np.full(codes.shape[0], CODE_BITS + 1, np.int64)
     count = 1
     while count < branching:
@@ -226,8 +215,7 @@ def _seed_centres(codes: CodeWords, branching: int, state: NDArray[np.uint64]) -
         reach = np.cumsum(nearest * nearest)
         if reach[-1] == 0:
             break
-        drawn = np.searchsorted(reach, int(_uniform(state) * reach[-1]), side="right")
-        _copy(codes, drawn, centres, count)
+        centres[count] = codes[np.searchsorted(reach, int(_uniform(state) * reach[-1]), side="right")]
         count += 1
     return centres[:count]
 

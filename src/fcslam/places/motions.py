@@ -130,8 +130,7 @@ def _best(a: FloatArray, b: FloatArray, seeds: NDArray[np.int64]) -> tuple[Float
         if count < MINIMUM_INLIERS or _near(pose, poses[:found]):
             continue
         poses[found, 0], poses[found, 1], poses[found, 2] = pose
-        for k in range(agrees.shape[0]):  # numba compiles an assignment of arrays for seconds
-            agreeing[found, k] = agrees[k]
+        agreeing[found] = agrees
         found += 1
         for index in range(scores.shape[0]):
             if scores[index] > 0.0 and _near(_pose(trials, index), poses[found - 1 : found]):

@@ -114,13 +114,17 @@ class CarmenArrays:
         return declared if len(self.ranges_m[scan]) == declared.beam_count else None
 
     def _flaser(self, line: bytes) -> int:
-        for words in (9, 6):  # with the times, and without
-            front, *tail = line.rsplit(None, words)
-            _, count, *text = front.split(None, 2)
-            values, rest = numbers_in(b"".join(text), int(count))
-            if len(values) and not rest.strip():
-                return self._scan(_stamp_of(tail[6]) if words == 9 else None, tail[:6], values)
-        raise ValueError("not as many ranges as stated")
+        front, *tail = line.rsplit(None, 9)
+        _, count, *text = front.split(None, 2)
+        values, rest = numbers_in(b"".join(text), int(count))
+        if len(values) and not rest.strip():
+            return self._scan(_stamp_of(tail[6]), tail[:6], values)
+        front, *tail = line.rsplit(None, 6)
+        _, _, *text = front.split(None, 2)
+        values, rest = numbers_in(b"".join(text), int(count))
+        if rest.strip():
+            raise ValueError("not as many ranges as stated")
+        return self._scan(None, tail, values)
 
     def _robotlaser(self, line: bytes) -> int:
         front, *tail = line.rsplit(None, 14)
@@ -142,6 +146,8 @@ class CarmenArrays:
         stated: LaserModel | None = None,
     ) -> int:
         """Add a scan; the log states no ``stamp`` if it is None."""
+        if len(ranges_m) == 0:
+            raise ValueError("not as many ranges as stated")
         if not (ranges_m.min() >= 0.0 and ranges_m.max() < _LONGEST_RANGE_M):
             is_range = (ranges_m >= 0.0) & np.isfinite(ranges_m)
             ranges_m = np.where(is_range, np.minimum(ranges_m, _LONGEST_RANGE_M), nan)
@@ -174,8 +180,8 @@ def _measured(front: bytes) -> tuple[FloatArray, LaserModel]:
     _, kind, start, fov, resolution, max_range, _, _, count, text = front.split(None, 9)
     values, rest = numbers_in(text, int(count))
     remission_count, *remissions = rest.split()
-    if len(values) == 0 or len(remissions) != int(remission_count):
-        raise ValueError("not as many ranges and remissions as stated")
+    if len(remissions) != int(remission_count):
+        raise ValueError("not as many remissions as stated")
     numbers = [float(token) for token in (start, fov, resolution, max_range)]
     return values, _stated_laser(int(kind), numbers, len(values))
 

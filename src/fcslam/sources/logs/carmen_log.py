@@ -26,6 +26,9 @@ from fcslam.sources.pose import UNKNOWN_POSE, pose_of
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
+_Entry = tuple[int, FloatArray]
+"""A scan or a reading of the odometry, counted as in ``CarmenArrays.contents``, and T_odom_base."""
+
 
 class _Reading(NamedTuple):
     survey: Survey
@@ -113,26 +116,27 @@ class CarmenLog:
         check_units(path, driven)
         # a line that states the angles says more
         telling = next((k for k in admitted if log.stated[k] is not None), admitted[0])
+        laser = laser_model(log, telling, admitted)
         notes = [f"the odometry {driven.fault}; it is not used", WITHOUT_ODOMETRY] if driven.fault else []
         placeholders = sample.placeholders()
         survey = Survey(
             scan_count,
             duration_s,
             driven.length_m,
-            (laser_model(log, telling, admitted),),
+            (laser,),
             faults,
             (*(f"{path}: {note}" for note in notes), *placeholder_note(path, placeholders, "")),
         )
         return _Reading(survey, pose_from_odometry, driven.fault is None, placeholders)
 
-    def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, tuple[int, FloatArray]]]:
-        """Lines with consistent scans and the odometry among them: number, content as in the arrays, T_odom_base."""
+    def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, _Entry]]:
+        """Lines with consistent scans, and with the readings of the odometry among them."""
         for number, entry in scan_window(self._posed(audit), scans, lambda entry: entry[0] >= 0, audit):
             if entry[0] in self._log.untimed:
                 audit.add(Fault.NO_STAMP, number)
             yield number, entry
 
-    def _posed(self, audit: Audit) -> Iterator[tuple[int, tuple[int, FloatArray]]]:
+    def _posed(self, audit: Audit) -> Iterator[tuple[int, _Entry]]:
         log, reading = self._log, self._reading
         unknown: FloatArray = frozen(UNKNOWN_POSE)
         latest: FloatArray | None = None

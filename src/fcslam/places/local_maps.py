@@ -1,0 +1,136 @@
+"""Local maps of two sessions around places that both saw, and how well they agree."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.geometry import se2
+from fcslam.lidar.map_agreement import LocalSubmap, Noise, PlaceAgreement, compare, local_map, noise_of, total
+from fcslam.lidar.scan import PointScan, keyscan_points
+from fcslam.lidar.submap import Submap, build_submap
+from fcslam.records import FloatArray, Keyscan, KeyscanId, LaserModel
+
+REACH_M = 45.0
+"""Keyscans up to this far from the middle of the matching places make a map: of both wings of a building that repeats
+itself."""
+MOST_KEYSCANS = 150
+"""Most keyscans of such a map; of more, evenly spaced ones."""
+
+LOCAL_M = 8.0
+"""Keyscans up to this far from a place make its local map."""
+LOCAL_RADIUS_M = 14.0
+"""Radius of a local map."""
+FEWEST_LOCAL_KEYSCANS, MOST_LOCAL_KEYSCANS = 4, 30
+PLACES_APART_M = 0.5 * LOCAL_M
+"""Distance of local maps, which overlap by half."""
+MOST_LOCAL_MAPS = 16
+"""Most places at which local maps are compared; of more, evenly spaced ones."""
+_NONE = KeyscanId("", -1)
+
+
+class SeenKeyscans(NamedTuple):
+    """The keyscans of a session that are left, and its lasers."""
+
+    keyscans: Sequence[Keyscan]
+    lasers: Sequence[LaserModel]
+
+
+class LocalMaps:
+    """Local maps of two sessions around separate places of the second one's path, which are built once."""
+
+    def __init__(
+        self,
+        seen: tuple[SeenKeyscans, SeenKeyscans],
+        poses: tuple[FloatArray, FloatArray],
+        drift: tuple[float, float],
+    ) -> None:
+        """``poses`` (N, 3) of all keyscans of both sessions, each in its own frame, metres and radians.
+
+        ``drift``: largest error of a transform between both at one place, metres and radians.
+        """
+        self._seen, self._poses, self._drift = seen, poses, drift
+        self._built: dict[tuple[int, int], LocalSubmap | None] = {}
+
+    @cached_property
+    def _places(self) -> NDArray[np.int64]:
+        return _separate(self._poses[1], np.arange(len(self._poses[1])), PLACES_APART_M)
+
+    def around(self, side: int, middle: FloatArray) -> tuple[list[Keyscan], KeyscanId, bool]:
+        """The keyscans of a session that are left around a point (2,), the nearest one, and whether none was released
+        there."""
+        distance_m = self._distance_m(side, middle)
+        keyscans = self._keyscans(side, middle, REACH_M, MOST_KEYSCANS)
+        is_complete = len(keyscans) >= min(MOST_KEYSCANS, int(np.count_nonzero(distance_m <= REACH_M)))
+        nearest = min((k.id for k in keyscans), key=lambda id_: float(distance_m[id_.number]), default=_NONE)
+        return keyscans, nearest, is_complete
+
+    def whole(self, side: int, keyscans: Sequence[Keyscan], anchor: int) -> Submap:
+        """The map of keyscans ``around`` a point, in the base of one of them."""
+        return build_submap(self._scans(side, keyscans, anchor), REACH_M)
+
+    def _scans(self, side: int, keyscans: Sequence[Keyscan], anchor: int) -> list[tuple[PointScan, FloatArray]]:
+        lasers, poses = self._seen[side].lasers, self._poses[side]
+        return [(keyscan_points(k, lasers), se2.between(poses[anchor], poses[k.id.number])) for k in keyscans]
+
+    def _distance_m(self, side: int, middle: FloatArray) -> FloatArray:
+        distance_m: FloatArray = np.hypot(*(self._poses[side][:, :2] - middle).T)
+        return distance_m
+
+    def _keyscans(self, side: int, middle: FloatArray, reach_m: float, most: int) -> list[Keyscan]:
+        distance_m = self._distance_m(side, middle)
+        near = [k for k in self._seen[side].keyscans if distance_m[k.id.number] <= reach_m]
+        return [near[row] for row in _at_most(np.arange(len(near)), most)]
+
+    def agreement(self, T_a_b: FloatArray) -> PlaceAgreement:
+        """Compare the local maps of both sessions wherever the first one was near a place of the second.
+
+        ``T_a_b`` between their frames at each keyscan of b, shape (N, 3), metres and radians; NaN: not known.
+        """
+        from scipy.spatial import cKDTree
+
+        from fcslam.lidar.uniqueness import align_map
+
+        poses_a, poses_b = self._poses
+        places = [row for row in self._places if np.isfinite(T_a_b[row, 0])]
+        in_a = se2.compose(T_a_b[places], poses_b[places])
+        found_m, found_rows = cKDTree(poses_a[:, :2]).query(in_a[:, :2], distance_upper_bound=LOCAL_M)
+        nearest = np.asarray(found_rows)
+        near = _at_most(np.flatnonzero(np.isfinite(found_m)), MOST_LOCAL_MAPS)
+        rows = [(int(nearest[k]), int(places[k])) for k in near]
+        maps = [(self._at(0, i), self._at(1, j)) for i, j in rows]
+        noises = [noise_of(filter(None, side)) for side in zip(*maps, strict=True)]
+        noise = Noise(*map(max, zip(*noises, strict=True))) if noises else Noise()
+        agreements = []
+        for (i, j), (map_a, map_b) in zip(rows, maps, strict=True):
+            if map_a is None or map_b is None:
+                continue
+            T_i_j = se2.compose(se2.between(poses_a[i], T_a_b[j]), poses_b[j])
+            aligned = align_map(map_a.submap, map_b.submap, T_i_j).T_a_b
+            off = se2.between(T_i_j, aligned)
+            # Farther off, another wall is the nearest one.
+            is_near = np.hypot(off[0], off[1]) < self._drift[0] and abs(off[2]) < self._drift[1]
+            agreements.append(compare(map_a, map_b, aligned if is_near else T_i_j, noise))
+        return total(agreements)
+
+    def _at(self, side: int, row: int) -> LocalSubmap | None:
+        if (side, row) not in self._built:
+            keyscans = self._keyscans(side, self._poses[side][row, :2], LOCAL_M, MOST_LOCAL_KEYSCANS)
+            scans = self._scans(side, keyscans, row)
+            is_enough = len(scans) >= FEWEST_LOCAL_KEYSCANS
+            self._built[side, row] = local_map(scans, LOCAL_RADIUS_M) if is_enough else None
+        return self._built[side, row]
+
+
+def _separate(poses: FloatArray, rows: NDArray[np.int64], apart_m: float) -> NDArray[np.int64]:
+    chosen: list[int] = []
+    for row in rows.tolist():
+        if not chosen or np.hypot(*(poses[row, :2] - poses[chosen, :2]).T).min() >= apart_m:
+            chosen.append(row)
+    return np.array(chosen, np.int64)
+
+
+def _at_most(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
