@@ -11,8 +11,7 @@ from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import InputError, PacketError, SourceError
 from fcslam.mission.localization import read_map
-from fcslam.mission.mission_file import edit_mission
-from fcslam.records import LaserScan, ManualClosure
+from fcslam.records import LaserScan
 from fcslam.runs import open_run, separations
 from fcslam.sources import open_source
 from fcslam.wire.messages import Hello
@@ -91,15 +90,6 @@ def test_a_robot_is_localized_in_the_map_of_its_floor(mapped):
             read_map(place, "3")
     with pytest.raises(SourceError, match="leave the floor out"):
         read_map(whole / "map.yaml", "1")
-
-
-def test_no_closure_by_hand_joins_floors(mapped):
-    whole, _ = mapped
-    run = open_run(whole)
-    stamps = [float(run.trajectories[name].stamps[0]) for name in "ac"]
-    closure = ManualClosure("a", stamps[0], "c", stamps[1], (0.0, 0.0, 0.0), (0.1, 0.1))
-    with pytest.raises(InputError, match="a and c are on different floors"):
-        edit_mission(whole, [closure], "me", 0.0)
 
 
 @pytest.mark.parametrize(

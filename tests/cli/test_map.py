@@ -3,7 +3,6 @@
 import csv
 import gzip
 import json
-import lzma
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ from fcslam.cli import main
 from fcslam.cli import map as mapping
 from fcslam.config import dump
 from fcslam.mission.mission import MissionConfig
-from tests.sources.carmen_text import drive, flaser, odom, pose_at, save
+from tests.sources.carmen_text import drive, flaser, pose_at, save
 
 pytestmark = pytest.mark.slow
 
@@ -79,15 +78,6 @@ def test_the_map_can_be_looked_at_and_served(run):
     assert set(np.unique(grid)) == {0, 205, 254}
     assert (grid == 254).sum() * meta["resolution"] ** 2 > 50.0, "square metres of free floor"
     assert cv2.imread(str(run / "map.png")).shape[2] == 3
-
-
-def test_one_recording_split_into_robots(logs, tmp_path, drawn):
-    assert run_map(logs[0], "--split", 2, "--output", tmp_path / "run") == 0
-    rows = rows_of(tmp_path / "run" / "robots.csv")
-    assert [row["robot"] for row in rows] == ["robot_1_1", "robot_1_2"]
-    counts = [int(row["scans"]) for row in rows]
-    assert sum(counts) == len(drawn.robots[0].stamps)
-    assert max(counts) - min(counts) <= 1
 
 
 def test_without_fusing_every_robot_has_its_own_map(logs, tmp_path, drawn, capsys):
@@ -161,16 +151,6 @@ BAD_LOGS = {
     "a truncated archive": (
         lambda at: written(at / "t.clf.gz", gzip.compress("\n".join(drive(500)).encode())[:-200]), "truncated"
     ),
-    "a truncated xz": (
-        lambda at: written(at / "t.clf.xz", lzma.compress("\n".join(drive(500)).encode())[:-200]), "truncated"
-    ),
-    "binary": (lambda at: written(at / "b.clf", np.random.default_rng(0).bytes(5000)), "of a known format"),
-    "no laser": (lambda at: save(at / "o.log", [odom(k, pose_at(k)) for k in range(30)]), "no laser scan"),
-    "time backwards": (lambda at: save(at / "r.log", drive(50)[::-1]), "time runs backwards"),
-    "three in one": (lambda at: save(at / "w.log", 3 * drive(300)), "time jumps back"),
-    "a change of beams": (
-        lambda at: save(at / "c.log", drive(30) + drive(40, start_stamp=200, beams=9)), "not of the laser of the first"
-    ),
     "a name too long": (lambda at: save(at / f"{'x' * 80}.log", drive(41)), "rename"),
 }  # fmt: skip
 
@@ -184,14 +164,6 @@ def test_a_bad_recording_is_refused(tmp_path, log, refused, make, reason, first)
     assert not (tmp_path / "run").exists()
 
 
-def test_two_recordings_of_one_name_are_refused(tmp_path, log, refused):
-    (tmp_path / "other").mkdir()
-    twin = save(tmp_path / "other" / "healthy.clf", drive(41))
-    assert "'healthy'" in refused("map", log, twin, "--output", tmp_path / "run")
-    assert "'healthy'" in refused("map", log, log, "--output", tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize("content", ["fleet: {join_map: false}", "- 1\n- 2", "{", "\x00", None])
 def test_a_bad_configuration_is_refused(tmp_path, log, refused, content):
     config = tmp_path / "config.yaml"
@@ -199,15 +171,6 @@ def test_a_bad_configuration_is_refused(tmp_path, log, refused, content):
         config.write_text(content)
     assert "config.yaml" in refused("map", log, "--config", config, "--output", tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(("force", "reason"), [((), "not a run folder"), (("--force",), "not a run folder")])
-def test_a_folder_that_is_not_a_run_is_never_touched(tmp_path, log, refused, force, reason):
-    run = tmp_path / "run"
-    run.mkdir()
-    (run / "thesis.tex").write_text("years of work")
-    assert reason in refused("map", log, "--output", run, *force)
-    assert names_in(run) == {"thesis.tex"}
 
 
 def test_a_run_is_only_replaced_with_force(tmp_path, log, refused):
@@ -230,11 +193,6 @@ def test_the_preset_of_the_paper_goes_under_the_configuration_file(tmp_path, log
     line = refused("map", log, "--config", "paper", "--config", file, "--output", tmp_path / "other")
     assert f"{file}: fleet: matcher.decision similarity measures no transform" in line
     assert "set fusion to two_point" in line
-
-
-def test_one_recording_can_be_split_only(tmp_path, log, refused):
-    other = save(tmp_path / "other.log", drive(41))
-    assert "--split cuts one" in refused("map", log, other, "--split", 2, "--output", tmp_path / "run")
 
 
 @pytest.mark.parametrize("force", [(), ("--force",)])

@@ -38,12 +38,6 @@ def test_what_is_no_run_is_told_in_one_line(run, tmp_path, refused):
     assert "damaged run folder" in refused("show", run)
 
 
-@pytest.mark.parametrize("name", ["map.pgm", "mission.fcslam"])
-def test_a_damaged_file_is_told_in_one_line(run, name, refused):
-    (run / name).write_text("P5 60 40 255 ")
-    assert name in refused("show", run)
-
-
 def test_a_huge_run_is_refused_before_it_is_read(run, refused):
     with (run / "map.pgm").open("ab") as file:
         file.truncate(LARGEST_BYTES + 1)  # without a block on the disk

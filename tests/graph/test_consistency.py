@@ -106,12 +106,6 @@ def test_an_alias_group_of_like_size_forbids_a_verdict() -> None:
     assert len(groups) == 2
 
 
-def test_a_small_alias_group_is_outvoted() -> None:
-    verdict = verdict_of(1, true=20, false=10, aliases=4)
-    assert verdict.dominant
-    assert set(verdict.members) <= set(range(30))
-
-
 GOOD, BAD = MapFit(500.0, 400.0, -np.inf, 300.0), MapFit(-100.0, 400.0, 500.0, 300.0)
 
 

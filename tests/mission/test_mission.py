@@ -158,13 +158,6 @@ def test_a_recording_may_have_any_name_that_a_robot_can_bear(tmp_path, drawn, na
         run_mission(sources, MissionConfig(), watch=lambda _: pytest.fail("worked"))
 
 
-def test_two_recordings_of_one_name_are_refused(logs, tmp_path):
-    copy = tmp_path / logs[0].name
-    copy.write_bytes(logs[0].read_bytes())
-    with pytest.raises(SourceError, match="robot_1"):
-        run_mission([open_source(logs[0]), open_source(copy)], MissionConfig())
-
-
 def test_a_refusal_by_the_cloud_is_not_lost(logs, monkeypatch):
     def refuse(_self, _packet):
         raise PacketError("no room")

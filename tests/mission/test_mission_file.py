@@ -4,7 +4,6 @@ import multiprocessing
 import os
 import shutil
 import sqlite3
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
@@ -210,16 +209,3 @@ def test_no_closure_by_hand_is_made_between_floors_that_users_named(tmp_path):
     with pytest.raises(InputError, match="different floors"):
         edit_mission(mission, [made], "me", 0.0)
     edit_mission(mission, [FloorLabel("anna", "2"), made], "me", 0.0)
-
-
-def test_two_people_who_edit_at_once_lose_nothing(tmp_path):
-    mission = Path(shutil.copy(GOLDEN, tmp_path / "mission.fcslam"))
-    with ThreadPoolExecutor(4) as people:
-        made = [
-            people.submit(edit_mission, mission, [Cut("anna", 1000.0, 1001.0 + k)], f"person{k}", 0.0) for k in range(8)
-        ]
-        numbers = sorted(edit.number for one in made for edit in one.result())
-    assert numbers == list(range(5, 13))
-    edits = read_mission(mission).edits
-    assert {edit.author for edit in edits[4:]} == {f"person{k}" for k in range(8)}
-    assert list(tmp_path.iterdir()) == [mission]

@@ -180,17 +180,6 @@ def test_places_from_before_the_first_vocabulary_are_found_by_words(visits):
     assert [match.i for match in matches if match.M] == [KeyscanId("a", 0)]
 
 
-def test_the_same_places_give_the_same_matches(visits):
-    def run():
-        matcher = visits.matcher(small_fleet=0, vocabulary=VocabularyConfig(train_batch=2))
-        found = []
-        for number, pose in enumerate((POSE_A, POSE_B, POSE_A + 0.3, POSE_B - 0.3)):
-            found += matcher.match(visits.visit(f"r{number}", number, room(), pose), {}, STRANGERS)
-        return [(m.i, m.j, m.similarity, m.T_i_j.tobytes()) for m in found]
-
-    assert run() == run()
-
-
 def test_in_a_joint_map_what_looks_most_alike_is_still_compared(visits):
     """The map may be wrong: likeness, not nearness, chooses whom to doubt it with; its own places do not count."""
     small = VocabularyConfig(train_batch=1)

@@ -132,15 +132,6 @@ def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_pat
     cloud.store.close()
 
 
-def test_a_worker_that_starts_again_goes_on_as_if_nothing_had_been(cloud):
-    packets = two_robots()
-    for part in np.array_split(np.arange(len(packets)), 4):
-        cloud.put([packets[k] for k in part])
-        cloud.worker.step()
-        cloud.restart()
-    assert content(cloud.finalize()) == expected()
-
-
 def test_a_worker_says_nothing_old_while_it_catches_up(cloud):
     packets = two_robots()
     cloud.put(packets)

@@ -40,13 +40,6 @@ def folders(tmp_path):
     return tmp_path, pairs
 
 
-def test_a_perfect_run_has_no_error_whatever_is_asked(folders):
-    folder, pairs = folders
-    errors = evaluate_relations(folder / "single", folder / "relations")
-    assert errors.used == errors.total == len(pairs)
-    assert errors.translation.maximum < 1e-6
-
-
 def test_across_robots_counts_by_hand(folders):
     folder, pairs = folders
     errors = evaluate_relations(folder / "several", folder / "relations", across_robots=True)

@@ -25,13 +25,6 @@ def test_the_same_command_writes_the_same_bytes_and_no_folder_twice(tmp_path, ca
     assert files(tmp_path / "one") == files(tmp_path / "two")
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path, capsys):
-    (tmp_path / "notes").write_text("mine")
-    assert main([*COMMAND, "--output", str(tmp_path)]) == 2
-    assert "is not empty; choose another place" in capsys.readouterr().err
-    assert files(tmp_path) == {Path("notes"): b"mine"}
-
-
 def test_a_full_disk_is_one_line_and_leaves_no_half_recording(tmp_path, capsys):
     with largest_file(50_000):
         assert main([*COMMAND, "--output", str(tmp_path / "full")]) == 2

@@ -1,7 +1,6 @@
 """The simulated fleet without a GL library: rays against an independent oracle, chance that stays where it belongs."""
 
 import importlib
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -108,12 +107,6 @@ def test_furniture_moves_before_every_robot_but_the_first():
 def test_too_many_robots_for_the_building():
     with pytest.raises(InputError, match=r"'flat'.* too small for 50 robots; simulate at most \d"):
         simulate_fleet(TINY.model_copy(update={"robots": 50}), 1)
-
-
-def test_without_mujoco_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r"needs MuJoCo.*pip install 'fcslam\[sim\]'"):
-        engine.mujoco()
 
 
 def test_without_a_gl_library_one_line_says_what_to_install(monkeypatch):
