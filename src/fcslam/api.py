@@ -26,7 +26,7 @@ from fcslam.mission.mission import (
 from fcslam.mission.mission_file import EMPTY, read_mission
 from fcslam.records import StrPath, Veto
 from fcslam.robot.calibrating import calibrated
-from fcslam.runs import Run, prepare_output
+from fcslam.runs import Run, open_run, prepare_output
 from fcslam.sources import BagOptions, Source
 
 if TYPE_CHECKING:
@@ -187,11 +187,11 @@ def changes(
         output: folder to write; by default nothing is written.
         force: replace changes that are at ``output``.
     """
-    from fcslam.mission.map_changes import check_output, find_changes, save_changes
+    from fcslam.mission.map_changes import changes_of, check_output, save_changes
 
     if output is not None:
         check_output(Path(output), force)
-    found = find_changes(Path(run), since, until, map_index)
+    found = changes_of(open_run(run), read_mission(Path(run)), since, until, map_index, str(Path(run)))
     if output is not None:
         save_changes(found, Path(output), force)
     return found

@@ -38,12 +38,11 @@ def changes(
     force: Force = False,
 ) -> None:
     """Show what appeared and disappeared in the building between two sessions or dates."""
-    from fcslam.mission.map_changes import PICTURE, TABLE, check_output, find_changes, save_changes
+    from fcslam import api
+    from fcslam.mission.map_changes import PICTURE, TABLE
 
     output = output or new_folder(CHANGES)
-    check_output(output, force)
-    found = find_changes(run, since, until, map_index)
-    save_changes(found, output, force)
+    found = api.changes(run, since=since, until=until, map_index=map_index, output=output, force=force)
     for kind in ("appeared", "disappeared"):
         regions = [region for region in found.regions if region.kind == kind]
         area_m2 = sum(region.area_m2 for region in regions)

@@ -55,9 +55,7 @@ def read_map(path: Path, floor: str = "") -> OccupancyMap:
     """Read the first map of a floor from a run folder, a mission file or a map of ROS. fcslam maps the packets of a
     mission file. A map of ROS is a YAML file of map_server and the image that it names.
 
-    Args:
-        path: the folder or file.
-        floor: the floor; name it where the run has several, because they may look the same.
+    Name the floor where the run has several, because they may look the same.
     """
     if path.suffix == Path(MISSION).suffix:
         return _mission_map(path, floor)
@@ -109,19 +107,9 @@ def run_localization(
     progress: Callable[[LocalizationProgress], None] = lambda _: None,
     update: bool = False,
 ) -> Run:
-    """Localize a robot in a map, which does not change meanwhile.
+    """Localize a robot in a map, as ``fcslam.localize`` does; ``initial`` is its ``initial_pose``, shape (3,).
 
-    Args:
-        source: the robot's recording.
-        occupancy: the map.
-        config: the settings of the robot.
-        initial: about where the recording starts in the map, (x, y, theta), shape (3,); None: anywhere.
-        progress: called every ``REPORTED_SCANS`` scans.
-        update: draw what the scans saw afterwards into the map of the run, where ``contradicting_scans`` of them
-            contradict it. The map before is beside it, as ``map_before``.
-
-    Returns:
-        The believed poses as trajectory, and every pose with standard deviations and quality.
+    ``progress`` is called every ``REPORTED_SCANS`` scans.
     """
     localizer = MapLocalizer(frozen_map(occupancy, "the map"), initial)
     robot = RobotFrontend(source.name, config.robot, localizer.submit)
@@ -180,13 +168,9 @@ class LocalizedDrive:
         return self._rows[-1] if self._rows else 0.0
 
     def add(self, stamp: float, travel_m: float, T_odom_base: FloatArray, estimate: MapEstimate | None) -> None:
-        """Append the next scan.
+        """Append the next scan, after a path of ``travel_m``, at a pose in the session's ``odom``, shape (3,).
 
-        Args:
-            stamp: seconds.
-            travel_m: path length so far.
-            T_odom_base: its pose in the session's ``odom``, shape (3,), metres and radians.
-            estimate: where that lies in the map; None: the robot is not localized.
+        ``estimate``: where that lies in the map; None: the robot is not localized.
         """
         if estimate is None:
             self._rows.extend((stamp, *6 * (np.nan,), 0.0))
@@ -205,12 +189,7 @@ class LocalizedDrive:
     def run(self, robot: str, occupancy: OccupancyMap, config: MissionConfig, fixes: int, losses: int) -> Run:
         """The run folder of the drive: believed poses, every scan, and the map.
 
-        Args:
-            robot: name of the robot.
-            occupancy: the map.
-            config: the settings of the robot.
-            fixes: how often it was found.
-            losses: how often it was localized and then was not.
+        ``fixes``: how often the robot was found; ``losses``: how often it was localized and then was not.
         """
         poses = self.poses(robot)
         believed = poses.believed()

@@ -18,9 +18,9 @@ from fcslam.errors import InputError, SourceError
 from fcslam.maps.changes import APPEARED, DISAPPEARED, Changes, compare
 from fcslam.maps.fusion import Period, fuse_periods, periods_of
 from fcslam.maps.occupancy_map import OccupancyMap, server_files
-from fcslam.mission.mission_file import SavedMission, read_mission
+from fcslam.mission.mission_file import SavedMission
 from fcslam.records import FloatArray, Keyscan, LaserModel
-from fcslam.runs import Run, open_run
+from fcslam.runs import Run
 from fcslam.storage.files import replacing_folder
 from fcslam.wire.messages import Hello
 
@@ -37,23 +37,10 @@ class _Seen(NamedTuple):
     lasers: Mapping[str, Sequence[LaserModel]]
 
 
-def find_changes(folder: Path, since: str | None = None, until: str | None = None, map_index: int = 0) -> Changes:
-    """Return the changes in a map of a run between two times.
-
-    Args:
-        folder: a run folder with a mission file.
-        since: the end of a session, a stamp, or a date or time of ISO 8601, in UTC if it has no zone; a date means the
-            end of the day. None: the oldest period.
-        until: as ``since``; None: the newest period.
-        map_index: number of the map.
-    """
-    return changes_of(open_run(folder), read_mission(folder), since, until, map_index, str(folder))
-
-
 def changes_of(
     run: Run, mission: SavedMission, since: str | None, until: str | None, map_index: int, name: str
 ) -> Changes:
-    """Like ``find_changes``, from a run and its mission; messages call the run ``name``.
+    """The changes in a map of a run between two times, as in ``fcslam.changes``; messages call the run ``name``.
 
     Keyscans that are newer than the run are left out.
     """

@@ -28,15 +28,9 @@ def check_closure(run: Run, decision: Veto | Pin) -> None:
 def region_in_map(
     run: Run, mission: SavedMission, map_index: int, use: RegionUse, name: str, polygon: Sequence[tuple[float, float]]
 ) -> MapRegion:
-    """A region, tied to the keyscan that is nearest to its centre.
+    """A region of a finished run, tied to the keyscan that is nearest to its centre.
 
-    Args:
-        run: the finished run.
-        mission: its mission.
-        map_index: number of the map in which the polygon is drawn.
-        use: what the region is for.
-        name: what it is called.
-        polygon: corners (x, y) in ``map``, metres.
+    ``polygon``: corners (x, y) in ``map``, metres.
     """
     check_polygon(polygon)
     corners = np.array(polygon, dtype=np.float64)
@@ -48,13 +42,9 @@ def region_in_map(
 
 
 def moved_map(run: Run, mission: SavedMission, map_index: int, T_new_map: FloatArray) -> Placement:
-    """The placement that moves a map by a motion.
+    """The placement that moves a map of a finished run by a motion.
 
-    Args:
-        run: the finished run.
-        mission: its mission.
-        map_index: number of the map.
-        T_new_map: the present frame in the new one, shape (3,), metres and radians.
+    ``T_new_map``: the present frame in the new one, shape (3,), metres and radians.
     """
     session, stamp, T_map_base = next(_keyscans(run, mission, map_index))
     x, y, theta = se2.compose(T_new_map, T_map_base).tolist()
@@ -62,14 +52,9 @@ def moved_map(run: Run, mission: SavedMission, map_index: int, T_new_map: FloatA
 
 
 def motion_to_points(points: Sequence[tuple[float, float]], targets: Sequence[tuple[float, float]]) -> FloatArray:
-    """The motion that brings points of a map nearest to their targets, in the least-squares sense.
+    """The motion that brings two or more points of a map nearest to their targets, in the least-squares sense, metres.
 
-    Args:
-        points: two or more points (x, y) in ``map``, metres.
-        targets: target of each point, metres.
-
-    Returns:
-        The present frame in the new one, shape (3,), metres and radians.
+    Returns the present frame in the new one, shape (3,), metres and radians.
     """
     T_new_map = n_point_alignment(np.array(targets).reshape(-1, 2), np.array(points).reshape(-1, 2))
     if not np.isfinite(T_new_map).all():

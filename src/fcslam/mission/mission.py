@@ -110,16 +110,7 @@ def run_mission(
     drive: Drive = one_by_one,
     live: Live = lambda _: None,
 ) -> Run:
-    """Map recordings together, one robot each.
-
-    Args:
-        sources: the recordings.
-        config: all settings.
-        watch: called with the progress.
-        inputs: what is known before the recordings.
-        drive: runs the robots.
-        live: called with the cloud after every packet.
-    """
+    """Map recordings together, one robot each; ``drive`` runs the robots."""
     onto = inputs.onto
     check_robots(sources)
     recordings = [source.name for source in sources]

@@ -134,15 +134,7 @@ def mission_bytes(
     refused: Sequence[StoredPacket],
     tracks: Mapping[str, Track],
 ) -> bytes:
-    """The mission file of a mission.
-
-    Args:
-        config: settings of the cloud.
-        edits: all edits, in their order.
-        packets: the packets in the order in which they took effect.
-        refused: packets without effect.
-        tracks: the scans of each session, by its name.
-    """
+    """The mission file of a mission; its packets in the order in which they took effect, the rest as it stores them."""
     with TemporaryDirectory() as place:
         with opened_copy(None) as store:
             store.configure(config)
@@ -156,13 +148,9 @@ def mission_bytes(
 
 
 def edit_mission(path: Path, contents: Sequence[Change | Undo], author: str, time_s: float) -> list[Edit]:
-    """Append edits to a mission file, all or none. Two people may edit at once: one waits for the other.
+    """Append edits to a mission file or that of a run folder, all or none, at ``time_s`` seconds since 1970.
 
-    Args:
-        path: the file, or the run folder that holds it.
-        contents: what to append.
-        author: who edits.
-        time_s: now, seconds since 1970.
+    Two people may edit at once: one waits for the other.
     """
     path = mission_path(path)
     try:

@@ -400,9 +400,9 @@ class MissionStore:
 
     def traffic(self) -> Ledger:
         """Traffic of accepted packets by label, and of refused ones."""
-        columns, groups = "robot, kind, channel, refusal IS NULL", "robot, kind, channel, refusal IS NULL"
+        groups = "robot, kind, channel, refusal IS NULL"
         statement = (
-            f"SELECT {columns}, count(*), CAST(sum(length(data)) AS BIGINT) FROM packets"
+            f"SELECT {groups}, count(*), CAST(sum(length(data)) AS BIGINT) FROM packets"
             f" GROUP BY {groups} ORDER BY {groups}"
         )
         accepted: dict[Label, Traffic] = {}

@@ -12,12 +12,13 @@ from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import replies
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
 from fcslam.errors import FcslamError, InputError, PacketError
+from fcslam.mission.mission_file import as_stored
 from fcslam.mission.mission_store import MissionStore, StoredPacket
-from fcslam.records import Channel, DetectorFile, Place
+from fcslam.records import Channel, DetectorFile
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS, MAXIMUM_PACKET_BYTES
-from fcslam.wire.messages import UPLINK, PacketKind
-from fcslam.wire.packets import decode, encode, read_label, read_number, unpacked_size
+from fcslam.wire.messages import UPLINK
+from fcslam.wire.packets import SizedPacket, decode, encode, read_number, unpacked_size
 
 AGENT_LEASE_S = 30.0
 """How long after its last request an agent keeps its robot to itself."""
@@ -290,10 +291,9 @@ def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], Re
 
 
 def _read(robot: str, data: bytes) -> StoredPacket:
-    packet, kind = decode(data), read_label(data).kind
-    if packet.robot != robot:
-        raise PacketError(f"a packet of robot {packet.robot}, sent by {robot}")
-    if kind not in UPLINK:
-        raise PacketError(f"{robot}: a {kind} goes to a robot, not to the cloud")
-    channel = packet.body.channel if isinstance(packet.body, Place) else None
-    return StoredPacket(robot, packet.epoch, packet.sequence, packet.time, PacketKind(kind), channel, data)
+    sized = SizedPacket(decode(data), data)
+    if sized.label.robot != robot:
+        raise PacketError(f"a packet of robot {sized.label.robot}, sent by {robot}")
+    if sized.label.kind not in UPLINK:
+        raise PacketError(f"{robot}: a {sized.label.kind} goes to a robot, not to the cloud")
+    return as_stored(sized)

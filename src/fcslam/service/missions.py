@@ -3,6 +3,7 @@
 import fcntl
 import shutil
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from pathlib import Path
 from typing import IO
 
@@ -164,11 +165,8 @@ class Missions:
             return
         if not folder.store.exists():
             raise UnknownMissionError(name, self.names)
-        store = MissionStore(folder.store)
-        try:
+        with closing(MissionStore(folder.store)) as store:
             store.export(path)
-        finally:
-            store.close()
 
     def import_mission(self, name: str, path: Path) -> None:
         """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open."""

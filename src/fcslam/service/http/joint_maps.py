@@ -153,15 +153,7 @@ def _qualities(folder: Path) -> tuple[QualityReply, ...]:
 def _certified(folder: Path, _: tuple[int, int]) -> tuple[QualityReply, ...]:
     content = json.loads(read_text(folder / f"{QUALITY}.json", folder, MOST_LAYER_BYTES))
     return tuple(
-        QualityReply(
-            map=int(k),
-            verdict=one["verdict"],
-            bar=one["bar"],
-            within=one["within"],
-            error_95=one["error_95"],
-            good_share=one["good_share"],
-            drives=tuple(drive["text"] for drive in one["drives"]),
-        )
+        QualityReply.model_validate({**one, "map": int(k), "drives": [drive["text"] for drive in one["drives"]]})
         for k, one in content.items()
     )
 

@@ -34,16 +34,10 @@ class Instance:
         follow: Callable[[], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take the name.
+        """Take the name, to run at most ``most_missions`` workers, which ``launch`` starts.
 
-        Args:
-            registry: the missions.
-            name: of this instance.
-            most_missions: how many workers it runs.
-            launch: starts the worker of a mission.
-            listen: receives an event, its number and the name of its mission, whoever has the mission's worker.
-            follow: called at each step, to take over what other instances put into the store.
-            clock: seconds.
+        ``listen`` receives an event, its number and the name of its mission, whoever has the mission's worker.
+        ``follow`` is called at each step, to take over what other instances put into the store.
         """
         self._registry, self._name, self._most, self._clock = registry, name, most_missions, clock
         self._launch, self._listen, self._follow = launch, listen, follow
