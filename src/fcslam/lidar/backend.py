@@ -30,9 +30,8 @@ class FinishedSubmap:
 
     anchor: int
     first: int
-    """First keyscan of the submap."""
     last: int
-    """Last one (inclusive)."""
+    """First and last keyscan of the submap."""
     surface: FloatArray
     """Points of the surfaces in the anchor's base, shape (N, 2), metres."""
     closures: tuple[Constraint, ...]
@@ -84,9 +83,7 @@ class LidarBackend:
         local, anchors = np.array(self._T_local_base).reshape(-1, 3), np.array(self._closer.keyscans)
         if not len(anchors):
             return local
-        poses = self._poses
-        if self._closer.has_closures:
-            poses = optimize_gnc(self._graph, poses).poses
+        poses = optimize_gnc(self._graph, self._poses).poses if self._closer.has_closures else self._poses
         before = np.maximum(np.searchsorted(anchors, np.arange(len(local)), "right") - 1, 0)
         return se2.compose(poses[before], se2.between(local[anchors[before]], local))
 

@@ -43,11 +43,10 @@ Pairs = NDArray[np.int64]
 
 
 class Estimate(NamedTuple):
-    """A number that was estimated."""
+    """A number that was estimated, and its standard deviation."""
 
     value: float
     sigma: float
-    """Standard deviation."""
 
     def differs(self, nominal: float, least: float, sigmas: float = 4.0) -> bool:
         """Whether it is significantly not ``nominal``, and by more than ``least``."""
@@ -68,9 +67,8 @@ class ScanMotions:
     turned_rad: FloatArray
     """Turn from the first beam to the last, shape (N,), as the scan was matched; NaN if it is unknown."""
     first_s: FloatArray
-    """Assumed time of the first beam after the stamp, shape (N,)."""
     last_s: FloatArray
-    """Assumed time of the last beam after the stamp, shape (N,)."""
+    """Assumed times of the first and the last beam after the stamp, shape (N,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +94,8 @@ class MotionCalibration:
     delay: Estimate | None = None
     """Time by the clock of the odometry at a stamp of the scans, less this stamp, seconds."""
     turn_scale: Estimate | None = None
-    """Turn by the scans per turn by odometry."""
     distance_scale: Estimate | None = None
-    """Distance by the scans per distance by odometry."""
+    """Turn and distance by the scans per turn and distance by odometry."""
     mounting: Mounting | None = None
     """Correction of the pose of the laser, in ``base``: x and y in metres, heading in radians."""
     sweep_share: Estimate | None = None

@@ -148,14 +148,15 @@ class LoopCloser:
         self._travel = np.append(self._travel, travel_m)
         self._held[later] = submap_bytes(submap)
         is_known = self._forget_surplus(anchors)
-        paths = self._paths_from(later)
+        closures = np.array(self._accepted, dtype=np.int64).reshape(-1, 2)
+        paths: FloatArray = _shortest_paths(later, np.diff(self._travel), closures, CLOSURE_PATH_M)
         candidates = self._candidates(later, anchors, paths)
         found = [
             closure
             for earlier in candidates[: 1 if is_known else MOST_CANDIDATES]
             if (closure := self._compare(earlier, later, anchors, paths[earlier])) is not None
         ]
-        accepted = [c for c in found if self._is_expected(c) or self._is_conclusive(c)]
+        accepted = [c for c in found if (c.check.loose and c.drift_m <= NARROW_M) or self._is_conclusive(c)]
         unsure = [c for c in found if c not in accepted]
         if self._recognizer is not None:
             self._recognizer.store(keyscan, self._submap(later).surface.points)
@@ -179,11 +180,6 @@ class LoopCloser:
         held = np.zeros(len(self.keyscans), np.bool_)
         held[list(self._held)] = True
         return held
-
-    def _paths_from(self, later: int) -> FloatArray:
-        closures = np.array(self._accepted, dtype=np.int64).reshape(-1, 2)
-        paths: FloatArray = _shortest_paths(later, np.diff(self._travel), closures, CLOSURE_PATH_M)
-        return paths
 
     def _candidates(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
         travel = self._travel
@@ -271,10 +267,6 @@ class LoopCloser:
         self._pending = [c for c in self._pending if c not in cluster]
         self._accepted += [(c.earlier, c.later) for c in accepted]
         return accepted
-
-    @staticmethod
-    def _is_expected(closure: LocalClosure) -> bool:
-        return closure.check.loose and closure.drift_m <= NARROW_M
 
     @staticmethod
     def _is_conclusive(closure: LocalClosure) -> bool:

@@ -36,9 +36,8 @@ class SearchWindow:
     radius_m: float
     angle_rad: float
     distance_penalty: float = 0.0
-    """Share of the score lost at its edge, as in Karto."""
     angle_penalty: float = 0.0
-    """Share of the score lost at the largest turn, as in Karto."""
+    """Shares of the score lost at its edge and at the largest turn, as in Karto."""
     cell_m: float = CELL_M
     """Side of a cell of the likelihood grid, metres."""
     smear_m: float = CELL_M

@@ -101,14 +101,12 @@ class SurfelField:
     @property
     def normals(self) -> FloatArray:
         """Unit normals of the surfels, (0, 0) where unknown, shape (N, 2)."""
-        normals: FloatArray = self.arrays.surfels[: self.arrays.used[1], 2:4]
-        return normals
+        return self.arrays.surfels[: self.arrays.used[1], 2:4]
 
     @property
     def solitary(self) -> NDArray[np.bool_]:
         """Surfels all of whose returns were solitary, shape (N,); of a field that is not compact."""
-        solitary: NDArray[np.bool_] = self.arrays.surfels[: self.arrays.used[1], 5] > 0.0
-        return solitary
+        return self.arrays.surfels[: self.arrays.used[1], 5] > 0.0
 
     def nearest(self, points: FloatArray) -> NDArray[np.int32]:
         """Label of the surfel nearest to the cell of each point (N, 2), metres, or ``EMPTY``; shape (N,)."""

@@ -43,7 +43,6 @@ class KartoTracker(ScanTracker):
         super().__init__(odometry)
         self._gate = travel_m, turn_rad
         self._T_local_newest: dict[frozenset[tuple[float, float, float]], FloatArray] = {}
-        """Pose of the newest keyscan of each laser."""
 
     def localize(self, scan: LaserScan) -> TrackingResult:
         """Find the pose of the next scan; the tracker does not change before ``commit``."""

@@ -34,22 +34,17 @@ which the oldest matches are forgotten: tyres wear."""
 @dataclass(frozen=True, slots=True)
 class OdometryModel:
     """Error of the wheel odometry since the last match, as the sum of a constant, a share of the travel and a share of
-    the turn. The defaults trust it little: wheels may slip by a third of the way."""
+    the turn: standard deviations in metres and radians, per metre of travel and radian of turn. The defaults trust it
+    little: wheels may slip by a third of the way."""
 
     is_measured: bool = True
     """Whether wheels measure the motion; false: it is predicted from the motion before."""
     position_m: float = 0.02
-    """Standard deviation of the position, constant part, metres."""
     position_per_travel: float = 0.3
-    """Standard deviation of the position per metre of travel, metres per metre."""
     position_per_turn_m: float = 0.05
-    """Standard deviation of the position per radian of turn, metres per radian."""
     heading_rad: float = 0.02
-    """Standard deviation of the heading, constant part, radians."""
     heading_per_turn: float = 0.2
-    """Standard deviation of the heading per radian of turn, radians per radian."""
     heading_per_travel_rad: float = 0.05
-    """Standard deviation of the heading per metre of travel, radians per metre."""
 
 
 WHEELS = OdometryModel()
@@ -60,9 +55,8 @@ class OdometryError(NamedTuple):
     """Scale of the error of a motion that wheel odometry measured; the same in every coordinate frame of the plane."""
 
     position_m: float
-    """Standard deviation of x and of y, metres."""
+    """Standard deviation of x and of y."""
     heading_rad: float
-    """Standard deviation of the heading, radians."""
 
     @property
     def information(self) -> FloatArray:

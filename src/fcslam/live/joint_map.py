@@ -193,11 +193,8 @@ def _on_discs(  # type: ignore[no-untyped-def]
 @njit(allocates=False)
 def _driven_on(T_map_before, T_odom_before, T_odom_base):  # type: ignore[no-untyped-def]
     """x, y and theta in ``map`` after a motion by odometry."""
-    dx, dy, turned = (
-        T_odom_base[0] - T_odom_before[0],
-        T_odom_base[1] - T_odom_before[1],
-        T_map_before[2] - T_odom_before[2],
-    )
+    dx, dy = T_odom_base[0] - T_odom_before[0], T_odom_base[1] - T_odom_before[1]
+    turned = T_map_before[2] - T_odom_before[2]
     cos, sin = np.cos(turned), np.sin(turned)  # of ``odom`` in ``map``
     return T_map_before[0] + cos * dx - sin * dy, T_map_before[1] + sin * dx + cos * dy, turned + T_odom_base[2]
 

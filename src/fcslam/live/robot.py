@@ -147,9 +147,8 @@ class Robot(LiveTracker):
             access = Server(server) if isinstance(server, str) else server
             sends = access is not None or wiring.transport is not None
             folder = _state_folder(state, sends or wiring.keeps_keyframes, stack)
-            outbox = (
-                None  # it refuses the folder of another robot or process, so it is opened before anything is deleted
-            )
+            # It refuses the folder of another robot or process, so it is opened before anything is deleted.
+            outbox = None
             if sends and folder is not None:
                 outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", self.name, LARGEST_OUTBOX_BYTES)))
             keyframes = _keyframe_folder(folder, wiring.resumes) if wiring.keeps_keyframes else None

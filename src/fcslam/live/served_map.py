@@ -54,10 +54,8 @@ def _read(client: MapClient, server: str) -> Run:
             for suffix, content in (("yaml", client.file(one.number, "yaml")), ("pgm", client.file(one.number, "pgm")))
         }
         if all(_fits(one, files, server) for one in served):
-            poses: tuple[FloatArray, FloatArray] = (
-                frozen(np.empty(0)),
-                frozen(np.empty((0, 3))),
-            )  # they stay in the cloud
+            # The poses stay in the cloud.
+            poses: tuple[FloatArray, FloatArray] = frozen(np.empty(0)), frozen(np.empty((0, 3)))
             trajectories = {
                 robot: RobotTrajectory(robot, one.number, *poses, one.floor) for one in served for robot in one.robots
             }

@@ -84,9 +84,8 @@ class NewImage:
 
     image: CameraImage
     scan: LaserScan
-    """The newest scan."""
     pose: ScanPose
-    """Its pose."""
+    """The newest scan and its pose."""
     scans: tuple[LaserScan, ...]
     """The newest scan of each laser."""
 
@@ -238,7 +237,8 @@ class _Session:
     def _submap_bodies(self, submap: FinishedSubmap, at_end: bool = False) -> list[Body]:
         bodies: list[Body] = list(submap.closures)
         if Channel.LIDAR in self._config.channels:
-            bodies.append(self._lidar_place(submap))
+            keyscan, described = KeyscanId(self._robot, submap.anchor), self._own_places.features(submap.anchor)
+            bodies.append(Place(keyscan, Channel.LIDAR, DETECTOR_VERSION, submap.first, submap.last, *described))
         complete = [view for view in self._views if at_end or view.id.number <= submap.anchor]
         self._views = self._views[len(complete) :]
         # A view outside of every submap is not a place: the robot may have jumped between two scans.
@@ -260,10 +260,6 @@ class _Session:
         sent = [view for view in views.values() if view.id.number in self._submaps]
         fresh = [view for view in sent if (view.id.number, view.detector_version) not in self._described]
         return [hello, *(self._camera_place(view) for view in fresh)]
-
-    def _lidar_place(self, submap: FinishedSubmap) -> Place:
-        keyscan, described = KeyscanId(self._robot, submap.anchor), self._own_places.features(submap.anchor)
-        return Place(keyscan, Channel.LIDAR, DETECTOR_VERSION, submap.first, submap.last, *described)
 
     def _camera_place(self, view: Place) -> Place:
         self._described.add((view.id.number, view.detector_version))

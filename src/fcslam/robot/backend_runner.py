@@ -56,11 +56,7 @@ class WorkerObject(Generic[Thing]):
         executor.submit(_make, name, make, arguments).result()
 
     def submit(self, function: Callable[..., Answer], *arguments: object) -> Future[Answer]:
-        """Queue ``function(object, *arguments)``.
-
-        Raises:
-            RuntimeError: the worker has ended, or the executor was shut down.
-        """
+        """Queue ``function(object, *arguments)``; a RuntimeError if the worker has ended."""
         return self._executor.submit(_call, self._name, function, arguments)
 
     def call(self, function: Callable[..., Answer], *arguments: object) -> Future[Answer]:

@@ -116,11 +116,16 @@ class RobotFrontend:
             case LaserScan():
                 self._begin_where_unconnected(record)
                 if self._repeated.admits(record):
-                    scan = self._predict(record)
-                    scan = self._mark(self._mapped.of(scan))
-                    self._process_scan(scan)
+                    if self._motion is self.odometry and self.odometry.check.says_nothing(record):
+                        self._begin_without_odometry()
+                    scan = self._session.place(record, self._before)
+                    self._process_scan(self._mark(self._mapped.of(scan)))
             case CameraImage() if self._config.uses_images:
-                self._process_image(self.motion.place_image(record))
+                image = self.motion.place_image(record)
+                if self._deferred:
+                    self._deferred.records.append(image)
+                else:
+                    self._describe(image)
             case GnssFix():
                 self._fixes.append(record)
         return self.ready()  # scans carry their odometry; images never leave the robot
@@ -172,11 +177,6 @@ class RobotFrontend:
             self.begin_session()
         self._before_s = self._before_s[1], scan.stamp
 
-    def _predict(self, scan: LaserScan) -> LaserScan:
-        if self._motion is self.odometry and self.odometry.check.says_nothing(scan):
-            self._begin_without_odometry()
-        return self._session.place(scan, self._before)
-
     def _begin_without_odometry(self) -> None:
         self._motion, held = PredictedMotion(), []
         if self.odometry.check.may_be_frozen:
@@ -203,7 +203,10 @@ class RobotFrontend:
         if self._deferred.is_doubtful(tracking, self._session):
             self._defer(scan, tracking)
         else:
-            self._map_admitted(deskewed, tracking)
+            if self._deferred:
+                self._map_deferred()
+                tracking = self._session.lidar.localize(deskewed)
+            self._map(deskewed, tracking)
         if self.newest is not None and not self._deferred:
             self._session.observe(scan.stamp, self.newest.pose, self.newest.tracked)
 
@@ -212,7 +215,7 @@ class RobotFrontend:
         tracked = TrackedScan(np.zeros(3), np.zeros((3, 3)), None, scan.sweep)
         self.newest = NewestScan(ScanPose(scan.stamp, 0, se2.IDENTITY), tracked, math.nan, is_deferred=True)
         self._before = scan
-        self._deferred.add(scan)
+        self._deferred.records.append(scan)
 
     def _bridge_gap(self, scan: LaserScan) -> LaserScan:
         """The scan; where nothing shows the motion to it, it begins a session, or is predicted and doubtful."""
@@ -229,7 +232,7 @@ class RobotFrontend:
         return scan
 
     def _defer(self, scan: LaserScan, tracking: TrackingResult) -> None:
-        self._deferred.add(self._session.follow(self._deferred.records, scan, tracking))
+        self._deferred.records.append(self._session.follow(self._deferred.records, scan, tracking))
         pose = self._session.lidar.scan_pose(scan.stamp, tracking.tracked)
         self.newest = NewestScan(pose, tracking.tracked, tracking.quality, is_deferred=True)
         if self._deferred.can_decide(self._session):
@@ -244,6 +247,7 @@ class RobotFrontend:
             case Outcome.OTHER_FLOOR:
                 self._end_session()
                 self.scan_poses.floor, self.scan_poses.is_new_floor = "", True
+        self._deferred.cabin.leave()
         self._map_deferred()
 
     def _end_deferral(self) -> None:
@@ -260,12 +264,6 @@ class RobotFrontend:
             else:
                 self._describe(record)
 
-    def _map_admitted(self, scan: LaserScan, tracking: TrackingResult) -> None:
-        if self._deferred:
-            self._map_deferred()
-            tracking = self._session.lidar.localize(scan)
-        self._map(scan, tracking)
-
     def _map(self, scan: LaserScan, tracking: TrackingResult) -> None:
         self.packets.advance(scan.stamp)
         due = [fix for fix in self._fixes if fix.stamp <= scan.stamp]
@@ -273,12 +271,6 @@ class RobotFrontend:
         for input in self._session.map(scan, tracking, due):
             self._submit(input)
         self.newest = NewestScan(self.scan_poses[-1], tracking.tracked, tracking.quality, is_deferred=False)
-
-    def _process_image(self, image: CameraImage) -> None:
-        if self._deferred:
-            self._deferred.add(image)
-        else:
-            self._describe(image)
 
     def _describe(self, image: CameraImage) -> None:
         view = self._session.view(image)

@@ -56,9 +56,7 @@ def _mapped_laser(laser: LaserModel, step: int) -> LaserModel:
     """The laser with every ``step``-th beam from its first on, and a maximum range that a packet can state."""
     count, first_rad, increment_rad = laser.beams
     every = laser.with_beams(Beams(-(-count // step), first_rad, step * increment_rad))
-    if every.max_range_m <= MAXIMUM_LASER_RANGE_M:
-        return every
-    return replace(every, max_range_m=MAXIMUM_LASER_RANGE_M)
+    return replace(every, max_range_m=min(every.max_range_m, MAXIMUM_LASER_RANGE_M))
 
 
 def _mapped_sweep(sweep: Sweep | None, beam_count: int, step: int) -> Sweep | None:

@@ -39,10 +39,8 @@ class MotionPrediction:
     """
 
     def __init__(self) -> None:
-        self._T_odom_base = np.zeros(3)
-        """Of the newest scan."""
-        self._T_odom_last = np.zeros(3)
-        """Of the scan before."""
+        self._T_odom_base = self._T_odom_last = np.zeros(3)
+        """Of the newest scan and of the scan before."""
         self._motion = np.zeros(3)
         """Between the last two scans, in the tangent space of the base (x, y, theta)."""
         self._elapsed_s = 0.0

@@ -56,8 +56,7 @@ class Session:
         """Jumps of the odometry up to the newest scan that was mapped."""
         self._scans: dict[tuple[float, float, float], LaserScan] = {}
         """The newest scan of each laser, by its mounting."""
-        self._fixed = -1
-        """The newest keyscan with a fix."""
+        self._fixed = -1  # newest keyscan with a fix
 
     def place(self, scan: LaserScan, before: LaserScan | None) -> LaserScan:
         """The next scan with its pose and velocity by odometry or prediction; ``before`` is the one before it."""
@@ -170,10 +169,6 @@ class DeferredScans:
             return True
         return is_doubtful(tracking, session.lidar, self._config, self.cabin.is_leaving)
 
-    def add(self, record: LaserScan | CameraImage) -> None:
-        """Defer a record as it is."""
-        self.records.append(record)
-
     def can_decide(self, session: Session) -> bool:
         """Whether there are enough scans to compare them with the map."""
         travel_m, most = GAP_TRAVEL_M if self.gap_s else DOUBTFUL_TRAVEL_M, MOST_SCANS
@@ -188,9 +183,13 @@ class DeferredScans:
 
     def decide(self, session: Session) -> Outcome:
         """Compare the scans with the newest keyscans of the session; scans that are found elsewhere are moved there."""
-        outcome = self._outcome(self._scans, session)
-        self.cabin.leave()
-        return outcome
+        lidar, gap_s, scans = session.lidar, self.gap_s, self._scans
+        if self.cabin.is_leaving and not gap_s:
+            return Outcome.OTHER_FLOOR if is_lost(scans, lidar, self.cabin.closed_s) else Outcome.SAME_PLACE
+        if not gap_s and is_lost(scans, lidar):
+            return Outcome.SAME_PLACE_OTHER_MAP if session.drove_on(scans) else Outcome.OTHER_PLACE
+        is_same = isinstance(session.motion, WheelOdometry) or session.motion.relocate(self.records, lidar, gap_s)
+        return Outcome.SAME_PLACE if is_same else Outcome.OTHER_PLACE
 
     def take(self) -> Deferred:
         """End the deferral; returns the records."""
@@ -200,12 +199,3 @@ class DeferredScans:
     @property
     def _scans(self) -> list[LaserScan]:
         return [record for record in self.records if isinstance(record, LaserScan)]
-
-    def _outcome(self, scans: list[LaserScan], session: Session) -> Outcome:
-        lidar, gap_s = session.lidar, self.gap_s
-        if self.cabin.is_leaving and not gap_s:
-            return Outcome.OTHER_FLOOR if is_lost(scans, lidar, self.cabin.closed_s) else Outcome.SAME_PLACE
-        if not gap_s and is_lost(scans, lidar):
-            return Outcome.SAME_PLACE_OTHER_MAP if session.drove_on(scans) else Outcome.OTHER_PLACE
-        is_same = isinstance(session.motion, WheelOdometry) or session.motion.relocate(self.records, lidar, gap_s)
-        return Outcome.SAME_PLACE if is_same else Outcome.OTHER_PLACE
