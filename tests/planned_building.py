@@ -99,3 +99,9 @@ def mapped(T_map_building=(3.0, -2.0, 0.6), scale=1.0, walls=WALLS, drift_rad=0.
         frozen(np.arange(len(true)), np.int64), (LASER,),
     )  # fmt: skip
     return FleetResult((robot,), (), (), PoseGraph(poses, edges)), true
+
+
+def off_m(placing, true):
+    """Distance of each pose from the truth."""
+    (robot,) = placing.result.robots
+    return np.hypot(*(robot.T_map_base[:, :2] - true[:, :2]).T)

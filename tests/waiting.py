@@ -2,11 +2,13 @@
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 
-def wait_for(condition: Callable[[], object]) -> None:
-    """Wait until ``condition`` is true, for two minutes at most."""
+def wait_for(condition: Callable[[], Any]) -> Any:
+    """Wait until ``condition`` is true, for two minutes at most, and return what it says."""
     end = time.monotonic() + 120.0
-    while not condition() and time.monotonic() < end:
+    while not (found := condition()) and time.monotonic() < end:
         time.sleep(0.01)
-    assert condition()
+    assert found
+    return found

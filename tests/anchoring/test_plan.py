@@ -16,7 +16,7 @@ from fcslam.errors import SourceError
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.occupancy_map import Occupancy, map_yaml, pgm_bytes
-from tests.planned_building import OTHER_WALLS, WALLS, mapped, plan_of
+from tests.planned_building import OTHER_WALLS, WALLS, mapped, off_m, plan_of
 
 pytestmark = pytest.mark.slow
 
@@ -29,11 +29,6 @@ def placed(result, plan=None, by_hand=()):
 def report_of(placing):
     (report,) = json.loads(placing.files["plan.json"])["maps"]
     return report
-
-
-def off_m(placing, true):
-    (robot,) = placing.result.robots
-    return np.hypot(*(robot.T_map_base[:, :2] - true[:, :2]).T)
 
 
 @pytest.mark.parametrize("T", [(3.0, -2.0, 0.6), (0.0, 0.0, 0.0), (-40.0, 7.0, -2.5)])

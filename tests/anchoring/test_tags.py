@@ -13,7 +13,7 @@ from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.records import KeyscanId, Tag, TagFamily, TagSighting, frozen
-from tests.planned_building import mapped
+from tests.planned_building import mapped, off_m
 
 FAMILY = TagFamily.APRILTAG_36H11
 WALL_TAGS = {1: (4.9, 1.0, np.pi), 2: (2.0, 5.9, -np.pi / 2), 3: (9.9, 1.0, np.pi), 4: (15.9, 2.0, np.pi),
@@ -40,11 +40,6 @@ def placed(result, seen, survey=None, by_hand=()):
         replace(result, sightings=seen), Anchors(survey=survey), by_hand,
         lambda members: fuse_members(members, OccupancyConfig()),
     )  # fmt: skip
-
-
-def off_m(placing, true):
-    (robot,) = placing.result.robots
-    return np.hypot(*(robot.T_map_base[:, :2] - true[:, :2]).T)
 
 
 def lines(placing):

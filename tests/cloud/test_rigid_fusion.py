@@ -14,29 +14,12 @@ from fcslam.geometry import se2
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import Channel, ClosureStatus, ReasonCode, Veto
 from tests import small_fleet
-from tests.scripted import ALIAS, closures, rectangle, stream, verified
+from tests.cloud.test_fleet import LATER, POSES, A, B, between, joint_error, two_robots
+from tests.cloud.test_fleet import TRUE as MEETINGS
+from tests.scripted import ALIAS, closures, verified
 from tests.small_fleet import feed, map_of
 
-POSES = rectangle()
-A, B = ("a", POSES), ("b", POSES)
-LATER = 1000.0
-MEETINGS = [(0, 0), (8, 8), (16, 16), (24, 24), (32, 32), (40, 40)]
 RIGID = FusionStrategy.TWO_POINT
-
-
-def two_robots():
-    return [*stream(*A, start_s=0.0), *stream(*B, start_s=LATER)]
-
-
-def error_m(result, robot_a="a", robot_b="b"):
-    """How far b's keyscans lie from the truth, seen from a's first; both drove the same poses."""
-    poses = {robot.robot: robot.T_map_base for robot in result.robots}
-    seen = se2.between(poses[robot_a][0], poses[robot_b])
-    return np.hypot(*(seen - se2.between(POSES[0], POSES))[:, :2].T).max()
-
-
-def between(result, status):
-    return [c for c in result.closures if c.i.robot != c.j.robot and c.status is status]
 
 
 def ledger_of(*scripts, turned=()):
@@ -106,7 +89,7 @@ def test_two_false_matches_that_fit_each_other_ruin_who_trusts_them(scripted, st
     script = [*closures(A, B, MEETINGS[:2], shift=ALIAS), *closures(A, B, MEETINGS[2:])]
     result = feed(scripted(script, fusion=strategy), two_robots()).finalize()
     assert map_of(result) == {"a": 0, "b": 0}
-    assert error_m(result) > off_m if off_m else error_m(result) < 1e-3
+    assert joint_error(result) > off_m if off_m else joint_error(result) < 1e-3
 
 
 @pytest.mark.slow
@@ -214,7 +197,7 @@ def test_words_alone_make_the_two_positions_one_in_the_live_map_as_in_the_finish
     cloud = feed(scripted(by_words(MEETINGS), fusion=RIGID), two_robots())
     live, finished = cloud.fleet.estimate(), cloud.finalize()
     assert map_of(live) == map_of(finished) == {"a": 0, "b": 0}
-    assert error_m(finished) < 1e-3
+    assert joint_error(finished) < 1e-3
     for now, then in zip(live.robots, finished.robots, strict=True):
         assert np.allclose(se2.between(now.T_map_base, then.T_map_base), 0.0, atol=1e-6)
     for now, then in zip(cloud.fleet.corrections(), finished.corrections, strict=True):

@@ -4,13 +4,12 @@ import json
 import os
 import subprocess
 import sys
-import time
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-WAIT_S = 60.0
+from tests.waiting import wait_for
 
 needs_dask = pytest.mark.skipif(
     subprocess.run([sys.executable, "-c", "import distributed"], capture_output=True, check=False).returncode != 0,
@@ -66,13 +65,3 @@ def written_address(file: Path) -> str | None:
     with suppress(FileNotFoundError, ValueError):
         return json.loads(file.read_text())["address"]
     return None
-
-
-def wait_for(found):
-    """Wait until something is true, and return it."""
-    end = time.monotonic() + WAIT_S
-    while time.monotonic() < end:
-        if result := found():
-            return result
-        time.sleep(0.05)
-    raise AssertionError("it did not come")

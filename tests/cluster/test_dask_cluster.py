@@ -25,7 +25,10 @@ from fcslam.service.credentials import make_cluster_credentials
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import READY, WorkerTask
 from tests import small_fleet
-from tests.cluster.clusters import Cluster, needs_dask, wait_for
+from tests.cluster.clusters import Cluster, needs_dask
+from tests.lidar.test_pair_verification import written
+from tests.mission.test_mission_file import contents
+from tests.waiting import wait_for
 
 pytestmark = [needs_dask, pytest.mark.slow]
 
@@ -50,13 +53,6 @@ def pairs():
 @pytest.fixture(scope="module")
 def expected(pairs):
     return written(verify_here(pairs, CONFIG))
-
-
-def written(checks):
-    return [
-        (check.T_a_b.tobytes(), check.information.tobytes(), check.strict, check.loose, check.partial, check.reason)
-        for check in checks
-    ]
 
 
 @pytest.fixture
@@ -212,10 +208,6 @@ def test_the_command_maps_the_same_on_a_cluster_and_on_processes(tmp_path, logs,
     capsys.readouterr()
     assert main([*arguments, str(tmp_path / "none"), "--workers", "tcp://127.0.0.1:x"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-
-
-def contents(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def test_the_worker_of_a_mission_uses_the_cluster_and_outlives_it(tmp_path):

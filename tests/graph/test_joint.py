@@ -116,15 +116,11 @@ def test_false_closures_are_found_out_and_true_ones_kept(seed: int, share: float
     assert solution.weights[robust & true].mean() > 0.9
 
 
-def world_of_two_truths() -> World:
+def test_a_group_of_liars_as_large_as_the_truth_joins_nobody() -> None:
     world = World(1)
     world.meet(0, 1, 12)
     world.meet(0, 1, 12, ALIAS)
-    return world
-
-
-def test_a_group_of_liars_as_large_as_the_truth_joins_nobody() -> None:
-    solution = solve_jointly((world := world_of_two_truths()).evidence(), SETTINGS)
+    solution = solve_jointly(world.evidence(), SETTINGS)
     assert solution.maps == (0, 1, 2)
     (link,) = solution.links
     assert link.decision.contested

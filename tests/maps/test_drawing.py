@@ -112,11 +112,6 @@ def test_of_very_many_closures_the_shortest_that_lie_apart_are_drawn():
     assert np.array_equal(all_of_them[above_legend], seen(map_png(fused, ways, kept))[above_legend])
 
 
-def test_the_same_input_makes_the_same_bytes():
-    fused, ways = walled(120, 180), {"a": way((0, 4), (1, 5), (2, 4))}
-    assert map_png(fused, ways) == map_png(fused, ways)
-
-
 def test_the_scale_bar_is_as_long_as_it_says():
     image = seen(map_png(walled(300, 600), {}))
     walls = where(image, WALL)

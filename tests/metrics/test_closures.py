@@ -13,6 +13,7 @@ from fcslam.metrics.closures import (
     revisits_found,
 )
 from fcslam.metrics.relations import PoseTable
+from tests.metrics.test_relations import matrix
 
 STEP_S, STEPS = 0.4, 60
 
@@ -41,11 +42,6 @@ def placed(run, truth, rows, components=None, frame=(0.0, 0.0, 0.0)):
     rows = np.asarray(rows)
     components = np.zeros(len(rows), dtype=np.int64) if components is None else np.asarray(components)
     return PoseReference(run, BRIDGE_S, rows, se2.compose(frame, truth[rows]), components)
-
-
-def matrix(pose):
-    x, y, theta = pose
-    return np.array([[np.cos(theta), -np.sin(theta), x], [np.sin(theta), np.cos(theta), y], [0.0, 0.0, 1.0]])
 
 
 frames = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3, 3))

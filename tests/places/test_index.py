@@ -307,12 +307,3 @@ def test_forgetting_gives_words_and_memory_back():
     assert len(index.postings.entries.blocks) <= 2 * blocks
     assert len(index.vocabulary.words) <= 2 * vertices
     assert len(index.postings.entries.leaves) <= 4 * sum(map(len, places.values()))
-
-
-@EVERY
-def test_the_same_places_give_the_same_index(strategy):
-    answers = []
-    for _ in range(2):
-        index, places = filled(strategy, seed=11)
-        answers.append((index.query(places[7], 50), index.vocabulary.words.tolist(), index.version))
-    assert answers[0] == answers[1]

@@ -7,7 +7,6 @@ import importlib.util
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -21,6 +20,7 @@ import pytest
 
 from fcslam.sources import write_bag
 from tests import small_fleet
+from tests.postgres import free_port
 from tests.robot import spinning
 from tests.ros.played import for_player
 
@@ -160,9 +160,7 @@ def test_a_robot_that_nobody_knows_on_ros_2():
 @pytest.fixture
 def port(tmp_path):
     """The port of a service."""
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     with fcslam("serve", "--data", tmp_path / "missions", "--port", port) as server:
         yield port
         server.kill()

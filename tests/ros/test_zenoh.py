@@ -1,6 +1,5 @@
 """The bridge on Zenoh against a peer that speaks as rmw_zenoh does."""
 
-import socket
 import threading
 
 import numpy as np
@@ -10,6 +9,7 @@ from fcslam.errors import InputError
 from fcslam.ros.network import Endpoint, Quality
 from fcslam.ros.ros2_zenoh import ZenohNetwork, endpoint_of, quality_text, session_config
 from fcslam.sources.bags.codec import SCAN, TRANSFORMS
+from tests.postgres import free_port
 from tests.ros.ros_messages import CODEC, encoded, scan, transform
 from tests.waiting import wait_for
 
@@ -25,9 +25,7 @@ HELLO, WORLD = (encoded(STRING, CODEC.make(STRING, data=word)) for word in ("hel
 
 @pytest.fixture(scope="module")
 def port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     router = zenoh_peer.router(port)
     yield port
     router.close()

@@ -1,6 +1,5 @@
 """Bags of every kind, as robots record them."""
 
-import dataclasses
 import math
 import os
 from copy import copy
@@ -11,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from fcslam.errors import SourceError
 from fcslam.records import LaserScan, Odometry
 from fcslam.sources import BagOptions, open_source, split
 from tests.sources.bag_messages import (
@@ -209,14 +207,6 @@ def test_the_user_chooses(tmp_path):
     assert source.survey().scan_count == 30
     assert source.survey().notes == ()
     assert scans_of(source)[0].T_odom_base[0] == 9.0
-
-
-def test_options_of_bags_are_refused_for_logs(tmp_path):
-    log = save_log(tmp_path / "run.log", drive_log(12))
-    with pytest.raises(SourceError, match="a CARMEN log has neither topics nor tf"):
-        open_source(log, BagOptions(scan_topics=("/scan",)))
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        BagOptions().scan_topics = ("/scan",)
 
 
 def test_a_name_may_be_given(tmp_path):

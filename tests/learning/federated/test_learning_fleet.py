@@ -6,7 +6,6 @@ They go through collection, rounds, release, adoption and describing old places 
 import csv
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -26,6 +25,7 @@ from fcslam.service.detectors import DetectorStore
 from fcslam.wire.messages import PacketKind
 from fcslam.wire.packets import decode
 from tests.lab.simulation.gl import require_gl
+from tests.postgres import free_port
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
@@ -36,13 +36,6 @@ SETTINGS = {
 }  # fmt: skip
 BROKEN_LAYER, NOISE = "body.code_head.0.0.weight", 6.0
 """Noise in this layer, in standard deviations of its weights, makes a detector that soon learns something."""
-
-
-def free_port():
-    """A port of this machine on which no process listens."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def heed_interrupts():

@@ -78,13 +78,10 @@ def test_a_robot_that_is_not_known_has_nothing_stored(desk):
     assert desk.told(desk.send("a", [])) == []
 
 
-@pytest.mark.parametrize(
-    ("data", "status"),
-    [([A[0], b"no packet", A[2]], 400), ([A[0], B[0]], 400), ([A[0], A[1][:-1]], 400)],
-)
-def test_a_refused_packet_has_an_index_and_a_reason(desk, data, status):
+@pytest.mark.parametrize("data", [[A[0], b"no packet", A[2]], [A[0], B[0]], [A[0], A[1][:-1]]])
+def test_a_refused_packet_has_an_index_and_a_reason(desk, data):
     response = desk.send("a", data)
-    assert response.status_code == status
+    assert response.status_code == 400
     assert response.json()["index"] == 1
     assert response.json()["error"]
     assert desk.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": 1}

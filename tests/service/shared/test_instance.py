@@ -20,6 +20,7 @@ from fcslam.service.shared.mission_tables import Lease, MissionTables
 from fcslam.service.shared.missions import SharedAgents
 from fcslam.service.shared.registry import Registry
 from tests.mission.test_mission_store import packet
+from tests.waiting import wait_for
 
 
 class Started:
@@ -64,13 +65,6 @@ def end_leases(postgres, name):
         postgres.rows(f"UPDATE {table} SET expires = '-infinity' WHERE {column} = ? RETURNING 1", (name,))
 
 
-def until(condition, timeout_s=120.0):
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 def held(registry):
     return {mission.name: mission.holder for mission in registry.missions() if mission.is_held}
 
@@ -96,7 +90,7 @@ def test_a_lease_ends_by_the_servers_clock_and_one_that_is_renewed_does_not(regi
     assert registry.renew([(kept, True)]) == {kept}
     other = Registry(postgres, "other", "process of other")
     taken = []
-    until(lambda: taken.extend(other.claim(9)) or taken)
+    wait_for(lambda: taken.extend(other.claim(9)) or taken)
     assert taken == [Lease(lost.mission, lost.fence + 1)]
     assert registry.renew([(kept, True), (lost, True)]) == {kept}
 
@@ -127,15 +121,15 @@ def test_after_the_store_was_gone_the_others_may_renew_before_anybody_claims(reg
     other, workers = instance(postgres, "other", clock=lambda: now[0], kind=Failing)
     is_gone.set()
     other.start()
-    until(lambda: True in seen)
+    wait_for(lambda: True in seen)
     end_leases(postgres, "one")
     is_gone.clear()
-    until(lambda: seen.count(False) > 2)
+    wait_for(lambda: seen.count(False) > 2)
     assert not workers
     assert registry.renew([(lease, True)]) == {lease}
     end_leases(postgres, "one")
     now[0] += GRACE_S
-    until(lambda: workers)
+    wait_for(lambda: workers)
     other.close()
 
 
@@ -155,18 +149,18 @@ def test_missions_are_spread_and_those_of_an_instance_that_ends_are_taken_over(r
         wanted(registry, postgres, f"m{k}")
     one, of_one = instance(postgres, "one")
     one.start()
-    until(lambda: len(held(registry)) == 6)
+    wait_for(lambda: len(held(registry)) == 6)
     two, of_two = instance(postgres, "two")
     two.start()
-    until(lambda: sorted(held(registry).values()).count("two") == 3 and len(held(registry)) == 6)
+    wait_for(lambda: sorted(held(registry).values()).count("two") == 3 and len(held(registry)) == 6)
     assert sum(not worker.is_stopped for worker in of_one) == 3
     two.close()
     assert all(worker.is_stopped for worker in of_two)
-    until(lambda: list(held(registry).values()) == ["one"] * 6)
+    wait_for(lambda: list(held(registry).values()) == ["one"] * 6)
     one.close()
     three, of_three = instance(postgres, "three")
     three.start()
-    until(lambda: list(held(registry).values()) == ["three"] * 6 and len(of_three) == 6)
+    wait_for(lambda: list(held(registry).values()) == ["three"] * 6 and len(of_three) == 6)
     assert {worker.lease.fence for worker in of_three} >= {2}
     three.close()
 
@@ -191,7 +185,7 @@ def test_the_open_mission_has_a_worker_before_others(registry, postgres):
     registry.open(numbers["new"])
     for _ in range(4):
         one.step()
-        until(lambda: len(held(registry)) == 0 or "new" in held(registry))
+        wait_for(lambda: len(held(registry)) == 0 or "new" in held(registry))
     assert held(registry) == {"new": "one"}, "another one makes room for it"
     one.close()
 
@@ -222,7 +216,7 @@ def test_a_mission_in_which_nothing_happens_rests_until_its_next_packet(registry
     assert held(registry) == {"quiet": "one"}
     after(2)
     one.step()
-    until(lambda: held(registry) == {})
+    wait_for(lambda: held(registry) == {})
     assert workers[0].is_stopped
     store.put([packet(sequence=1)], 0.0)
     one.step()
