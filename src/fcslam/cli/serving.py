@@ -138,12 +138,7 @@ def make_server(
 
 
 def learning_settings(data: Path, store: str | None) -> FleetLearningSettings:
-    """Check all that learning needs, before anything starts.
-
-    Args:
-        data: folder of the missions; it may hold a file of settings.
-        store: database of the missions; None: they are files.
-    """
+    """Check all that learning needs, before anything starts; the folder ``data`` may hold a file of settings."""
     if store is not None:
         raise InputError("--learn works with missions in --data; leave out --store")
     config = data / LEARNING_FILE

@@ -53,8 +53,7 @@ def triplet_loss(
         candidates: (..., N, N) bool: pairs that may be d(c, n).
         valid: (..., N) bool: points that count.
         margin: by which the negative must be farther away than the match.
-        negatives: the paper does not say which; the hardest one, or all of them, which is what random ones give in the
-            mean.
+        negatives: all of them give what random ones give in the mean.
     """
     positive = distances.diagonal(dim1=-2, dim2=-1)
     if negatives == "hardest":

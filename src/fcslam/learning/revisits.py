@@ -122,15 +122,10 @@ def correspond_predicted(
 
 
 def revisits_in_map(frames: Sequence[Keyframe], T_map_base: FloatArray) -> list[tuple[int, int, NDArray[np.int64]]]:
-    """Find what keyframes of one map show again, from whatever time.
+    """Find what N keyframes of one map, at their estimated poses (N, 3), show again, from whatever time.
 
-    Args:
-        frames: N keyframes.
-        T_map_base: their estimated poses in the map, shape (N, 3), metres and radians.
-
-    Returns:
-        The numbers of two keyframes, and those of their keypoints that are the same points, shape (M, 2), with M at
-        least ``FEWEST_SHARED``.
+    Returns the numbers of two keyframes, and those of their keypoints that are the same points, shape (M, 2), with M at
+    least ``FEWEST_SHARED``.
     """
     pairs = []
     for i, first in enumerate(frames):

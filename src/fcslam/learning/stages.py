@@ -82,18 +82,10 @@ def train_detector(
     on_progress: StageCallback,
     start: KeypointNetwork | None = None,
 ) -> tuple[KeypointNetwork, TrainingImages]:
-    """Train on the images below ``roots``.
+    """Train on the images below ``roots``; returns the trained network and the images.
 
-    Args:
-        roots: folders of images.
-        folder: for all files of the run; a run in it is continued.
-        settings, options: of the run.
-        teacher: folder of a teacher's files; None without a teacher.
-        on_progress: called after every step.
-        start: trained network from which training starts; None to start anew.
-
-    Returns:
-        The trained network, and the images that it was trained on.
+    ``folder`` gets all files of the run; a run in it is continued. ``teacher``: folder of a teacher's files, if there
+    is one. ``start``: trained network from which training starts; None to start anew.
     """
     own = folder.resolve()
     found = read_images([file for file in find_images(roots) if not file.path.resolve().is_relative_to(own)])
@@ -128,15 +120,10 @@ def label_images(
     teacher: Path | None = None,
     on_progress: ProgressCallback = lambda *_: None,
 ) -> TrainingImages:
-    """Label images that have no labels in ``cache`` yet.
+    """Label images that have no labels in the folder ``cache`` yet.
 
-    Args:
-        found: the images.
-        cache: folder of the labels.
-        settings: of the run.
-        labeller: gives the response by which images are labelled, beside Harris's measure; None for that alone.
-        teacher: folder of a teacher's files, whose keypoints replace those of the labeller; None without a teacher.
-        on_progress: called after every image.
+    ``labeller`` gives the response by which images are labelled, beside Harris's measure; None for that alone.
+    ``teacher``: folder of a teacher's files, whose keypoints replace those of the labeller; None without a teacher.
     """
     train: list[TrainingExample] = []
     held_out: list[TrainingExample] = []

@@ -5,6 +5,7 @@ from typing import Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from fcslam.features.codes import CODE_BITS, hamming_matrix, mutual_matches
@@ -18,9 +19,10 @@ from fcslam.learning.homography import (
     matching_accuracy,
     repeatability,
 )
+from fcslam.learning.labels import Points
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.pairs import TrainingExample, ViewPair, draw_pair
-from fcslam.records import Codes, FloatArray
+from fcslam.records import Codes
 
 VALIDATION_PAIRS: Final = 24
 VALIDATION_VIEW: Final = (320, 240)
@@ -46,11 +48,12 @@ def validation_pairs(held_out: Sequence[TrainingExample]) -> list[ViewPair]:
 
 
 @torch.inference_mode()
-def detect(network: KeypointNetwork, image: Tensor) -> tuple[FloatArray, Codes]:
-    """Keypoints (N, 2) [px] of one image (1, 1, H, W), strongest first, and their codes (N, 32)."""
+def detect(network: KeypointNetwork, image: Tensor, config: OnnxConfig) -> tuple[Points, NDArray[np.float32], Codes]:
+    """Keypoints (N, 2) [px] of one image (1, 1, H, W), strongest first, their strengths, and their codes (N, 32)."""
     maps = network(image)
-    points, _ = find_peaks(network.scores(maps)[0].cpu().numpy(), ROBOT.least_score, ROBOT.nms_px, ROBOT.most_features)
-    return points.astype(np.float64), sample_codes(maps.code_logits[0].cpu().numpy(), points)
+    scores = network.scores(maps)[0].cpu().numpy()
+    points, strengths = find_peaks(scores, config.least_score, config.nms_px, config.most_features)
+    return points, strengths, sample_codes(maps.code_logits[0].cpu().numpy(), points)
 
 
 def validate(network: KeypointNetwork, pairs: Sequence[ViewPair], device: torch.device) -> dict[str, float]:
@@ -79,7 +82,8 @@ def collapse_warnings(figures: dict[str, float]) -> list[str]:
 
 def _validate_pair(network: KeypointNetwork, pair: ViewPair, device: torch.device) -> dict[str, float]:
     images = [torch.from_numpy(view.image)[None, None].to(device) for view in pair.views]
-    (first, first_codes), (second, second_codes) = (detect(network, image) for image in images)
+    (first, _, first_codes), (second, _, second_codes) = (detect(network, image, ROBOT) for image in images)
+    first, second = first.astype(np.float64), second.astype(np.float64)
     size = (images[0].shape[-1], images[0].shape[-2])
     here, there = in_common_view(first, pair.homography, size), in_common_view(second, inverse(pair.homography), size)
     matches = mutual_matches(first_codes[here], second_codes[there]).pairs

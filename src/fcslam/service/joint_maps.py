@@ -187,9 +187,7 @@ class ServedJointMaps:
     def explorations(self, maps: JointMaps, now_s: float) -> dict[int, Exploration]:
         """The frontiers of each map, about ``ASSIGN_EVERY_S`` old at most; of large maps older. None before the first.
 
-        Args:
-            maps: as ``follow`` returns them.
-            now_s: seconds since 1970.
+        ``now_s``: seconds since 1970.
         """
         made_s, until_s, found = self._explorations
         is_fresh = made_s <= now_s < until_s and found.keys() == set(maps.frames.values())

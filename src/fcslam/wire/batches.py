@@ -36,9 +36,7 @@ def write_batch(packets: Iterable[bytes]) -> bytes:
 def read_batch(data: bytes) -> list[bytes]:
     """Split a batch into encoded packets, without decoding them.
 
-    Raises:
-        PacketError: ``data`` is not a batch; the message says why. No packet is returned then, as any byte may be
-            corrupt.
+    A ``PacketError`` says why ``data`` is not a batch. No packet is returned then, as any byte may be corrupt.
     """
     _check_size(len(data))
     packets: list[bytes] = []

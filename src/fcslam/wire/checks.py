@@ -71,8 +71,7 @@ def check(packet: Packet) -> None:
     _check_numbers(packet)
     _require(math.isfinite(packet.time), "time is not finite")
     robot = body.id.robot if isinstance(body, Keyscan | Place | TagSighting | KeyscanFix) else body.robot
-    if robot != packet.robot:
-        raise PacketError(f"a packet of robot {packet.robot} holds a record of robot {robot!r}")
+    _require(robot == packet.robot, f"a packet of robot {packet.robot} holds a record of robot {robot!r}")
     _check_numbers(body)
     match body:
         case Hello():
@@ -109,15 +108,16 @@ def _check_numbers(record: object) -> None:
 
 def check_name(name: str, what: str) -> None:
     """Refuse a name that is not 1 to 64 letters, digits and ``. _ + -``."""
-    if NAME.fullmatch(name) is None:
-        raise PacketError(f"{what}: {name[:64]!r} is not a name (1-64 of A-Z a-z 0-9 . _ + -)")
+    _require(NAME.fullmatch(name) is not None, f"{what}: {name[:64]!r} is not a name (1-64 of A-Z a-z 0-9 . _ + -)")
 
 
 def _check_hello(hello: Hello) -> None:
     count = len(hello.lasers)
     _require(0 < count <= limits.MAXIMUM_LASERS, f"hello: {count} lasers, not in 1..{limits.MAXIMUM_LASERS}")
     for laser in hello.lasers:
-        _check_laser(laser)
+        _check_beams(laser.beams)
+        _check_numbers(laser)
+        _check_pose(np.array(laser.T_base_laser), "laser: T_base_laser")
     for channel, version in hello.detector_versions.items():
         check_name(version, f"hello: detector version of {channel}")
     if hello.floor:
@@ -127,12 +127,6 @@ def _check_hello(hello: Hello) -> None:
 def check_floor(floor: str) -> None:
     """Refuse a floor that is not 1 to 16 letters, digits and ``. _ + -``; "-1" is one."""
     _require(FLOOR.fullmatch(floor) is not None, f"floor {floor[:64]!r} is not 1 to 16 of A-Z a-z 0-9 . _ + -")
-
-
-def _check_laser(laser: LaserModel) -> None:
-    _check_beams(laser.beams)
-    _check_numbers(laser)
-    _check_pose(np.array(laser.T_base_laser), "laser: T_base_laser")
 
 
 def _check_beams(beams: Beams) -> None:
@@ -213,8 +207,7 @@ def _check_pose(pose: FloatArray, what: str, maximum_angle_rad: float = FULL_TUR
 
 
 def _check_shape(array: NDArray[Any], shape: tuple[int, ...], what: str) -> None:
-    if array.shape != shape:
-        raise PacketError(f"{what} have shape {array.shape}, not {shape}")
+    _require(array.shape == shape, f"{what} have shape {array.shape}, not {shape}")
 
 
 def _require(condition: bool, reason: str) -> None:

@@ -88,11 +88,7 @@ class HttpClient:
     """A longer reply is not read: a map of 16,000 by 16,000 cells has as many bytes."""
 
     def __init__(self, url: str, shown: Credentials = NO_CREDENTIALS, headers: Mapping[str, str] | None = None) -> None:
-        """Open a client of the address ``url``, or of several with commas between them; each request has the headers.
-
-        Raises:
-            CloudError: it is no address, a token would be sent unencrypted, or a file of ``shown`` cannot be read.
-        """
+        """Open a client of the address ``url``, or of several with commas between them; requests have the headers."""
         import httpx
 
         self._urls = deque(address.rstrip("/") for address in addresses(url))
@@ -275,8 +271,7 @@ def _detail(response: "httpx.Response") -> dict[str, Any]:
 def _check_url(url: str, shown: Credentials) -> None:
     try:
         parts = urlsplit(url)
-        has_place = parts.hostname and parts.port != 0 and not any(map(str.isspace, url))
-        is_address = parts.scheme in ("http", "https") and has_place
+        is_address = parts.scheme in ("http", "https") and parts.port != 0 and not any(map(str.isspace, url))
     except ValueError:  # the port, or a bracket of IPv6
         is_address = False
     if not is_address or not parts.hostname:

@@ -64,11 +64,7 @@ def measure(packet: Packet) -> SizedPacket:
 
 
 def decode(data: bytes) -> Packet:
-    """Decode a packet and check everything that does not depend on other packets.
-
-    Raises:
-        PacketError: ``data`` is not a valid packet of this version; the message says why.
-    """
+    """Decode a packet and check what does not depend on other packets; a ``PacketError`` says why it is not valid."""
     message, kind = _parse(data)
     _, _, read = CODECS[kind]
     body = read(getattr(message, kind), message)

@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from fcslam.features.codes import mutual_matches
-from fcslam.features.dense import find_peaks, sample_codes
 from fcslam.features.detector import ImageFeatures, OnnxConfig
 from fcslam.geometry import se2
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.revisits import Keyframe, correspond, revisits_in_map
+from fcslam.learning.validation import detect
 from fcslam.places.motions import LARGEST_HAMMING, level_matches, rigid_hypotheses
 from fcslam.records import FloatArray, frozen
 
@@ -104,11 +104,8 @@ def same_pairs(first: Mapping[str, Judgement], second: Mapping[str, Judgement]) 
 
 def _described(network: KeypointNetwork, frame: Keyframe, device: torch.device) -> Keyframe:
     """The frame with the keypoints and codes of the network, found as robots do."""
-    config = OnnxConfig()
-    maps = network(torch.from_numpy(frame.image.astype(np.float32) / 255.0)[None, None].to(device))
-    scores = network.scores(maps)[0].cpu().numpy()
-    points, strengths = find_peaks(scores, config.least_score, config.nms_px, config.most_features)
-    codes = sample_codes(maps.code_logits[0].cpu().numpy(), points)
+    image = torch.from_numpy(frame.image.astype(np.float32) / 255.0)[None, None].to(device)
+    points, strengths, codes = detect(network, image, OnnxConfig())
     features = ImageFeatures(frozen(points, np.float32), frozen(strengths, np.float32), frozen(codes, np.uint8))
     return Keyframe.of(frame.image, features, frame.camera, frame.surroundings)
 

@@ -70,11 +70,7 @@ def write_request(request: TrainingRequest) -> bytes:
 
 
 def read_request(data: bytes) -> TrainingRequest:
-    """Read a request on the robot.
-
-    Raises:
-        InputError: these bytes are not a request of this version of fcslam.
-    """
+    """Read a request on the robot; an ``InputError`` if these bytes are not one of this version of fcslam."""
     try:
         header, weights = _unpack(data)
         settings = FederatedSettings.model_validate(header["settings"])

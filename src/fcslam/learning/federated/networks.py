@@ -21,11 +21,7 @@ def network_to_weights(network: KeypointNetwork) -> dict[str, NDArray[np.float32
 
 
 def weights_to_network(weights: Weights, encoder: Encoder) -> KeypointNetwork:
-    """A network with these weights, in evaluation mode.
-
-    Raises:
-        InputError: the weights belong to another network, or are not finite.
-    """
+    """A network with these weights, in evaluation mode."""
     empty = KeypointNetwork(encoder)
     reason = weights_error(weights, network_to_weights(empty))
     if reason is not None:

@@ -86,11 +86,7 @@ class RobotLink(HttpClient):
             return int(response.headers[NUMBER_HEADER]), response.content
 
     def reply(self, number: int, body: bytes) -> str:
-        """Bring a reply; returns the reason why the server does not want it, or nothing.
-
-        Raises:
-            CloudError, UnavailableError: as in ``fetch``.
-        """
+        """Bring a reply; returns the reason why the server does not want it, or nothing. Raises as ``fetch``."""
         response = self._ask("POST", f"{self._path}reply/{number}", body, passes=(204, 410, 413))
         return response.content.decode(errors="replace")
 
@@ -106,9 +102,6 @@ def serve_requests(
 
     ``on_notice`` is called with one line for a request that was refused, and while the server is not there.
     ``is_ready`` is asked before each request; if false, the robot asks for none now.
-
-    Raises:
-        CloudError: the server does not accept the robot.
     """
 
     def retried(operation: Callable[[], _T]) -> _T:
@@ -217,11 +210,7 @@ class LearningRobot:
         self._seen = 0
 
     def pause(self, _robot: str = "", _steps: int = 0) -> None:
-        """Before each step: wait while the robot is busy.
-
-        Raises:
-            InputError: the budget is spent.
-        """
+        """Before each step: wait while the robot is busy; an ``InputError`` if the budget is spent."""
         if time.process_time() > self._cpu_s:
             raise InputError(f"the CPU time for learning is spent ({self._cpu_s:.0f} s)")
         self._idle.wait()

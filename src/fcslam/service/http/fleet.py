@@ -242,11 +242,7 @@ def _finite(value: float) -> float | None:
 
 
 def read_rounds(folder: Path) -> list[LearningRound]:
-    """The rounds so far, oldest first; none before the first one is done.
-
-    Raises:
-        InputError: the table is damaged.
-    """
+    """The rounds so far, oldest first; none before the first one is done."""
     path = folder / ROUNDS_FILE
     try:
         with path.open(newline="", encoding="utf-8") as file:
