@@ -68,7 +68,7 @@ class _Keeping:
     def submit(self, input: BackendInput) -> "Future[list[Body]]":
         """As the back end does."""
         if input is Task.END_SESSION and self.kept is None:
-            self.kept = self._backend.keyframes
+            self.kept = self._backend.views.keyframes
         return self._submit(input)
 
 

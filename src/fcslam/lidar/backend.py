@@ -1,7 +1,4 @@
-"""Back end of one robot's LiDAR SLAM: submaps, loop closures between them, and the pose graph of keyscans (Karto).
-
-Its state is a function of the keyscans in their order, whenever it gets them.
-"""
+"""Back end of one robot's LiDAR SLAM: submaps, loop closures between them, and the pose graph of keyscans (Karto)."""
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence

@@ -19,7 +19,7 @@ from fcslam.geometry.beams import is_same_laser
 from fcslam.lidar.evidence import CORRELATED, SIGMA_PER_TURN
 from fcslam.lidar.information import limited_information
 from fcslam.lidar.karto import KartoTracker
-from fcslam.lidar.odometry import WHEELS, OdometryModel, OdometryTrust, odometry_error
+from fcslam.lidar.odometry import WHEELS, OdometryModel, odometry_error
 from fcslam.lidar.own_body import Polygon, Sectors
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.lidar.submap import LEVER_M, Submap, build_submap
@@ -142,7 +142,7 @@ class LidarFrontend:
         self.robot = robot
         self.config = config
         self.odometry = odometry
-        self._tracker = _tracker(config, odometry)
+        self.tracker = _tracker(config, odometry)
         self._lasers: list[LaserModel] = []
         """Each with the beams of its first scan."""
         self._count = 0
@@ -160,13 +160,13 @@ class LidarFrontend:
 
     def localize(self, scan: LaserScan) -> TrackingResult:
         """Find the pose of the next scan; nothing changes before ``process``."""
-        return self._tracker.localize(scan)
+        return self.tracker.localize(scan)
 
     def process(self, scan: LaserScan, tracking: TrackingResult | None = None) -> Step:
         """Process the next scan, with its result of ``localize`` if that was called before; returns what it became."""
         # 1. Scan matching against the running buffer.
-        tracking = self._tracker.localize(scan) if tracking is None else tracking
-        self._tracker.commit(tracking)
+        tracking = self.tracker.localize(scan) if tracking is None else tracking
+        self.tracker.commit(tracking)
         tracked = tracking.tracked
         # 2. After enough motion the scan becomes a keyscan.
         laser = laser_index(self._lasers, scan.laser)
@@ -188,18 +188,9 @@ class LidarFrontend:
         """Path length since the local map began, metres; as ``travel_m``, unless another one was begun."""
         return self.travel_m - self._begun_m
 
-    @property
-    def trust(self) -> OdometryTrust:
-        """Trust in odometry, learned from all matches so far."""
-        return self._tracker.trust
-
-    def T_odom_base(self, T_local_base: FloatArray) -> FloatArray:
-        """Pose by odometry, shape (3,), of a scan that is predicted at a pose in the tracker's frame, shape (3,)."""
-        return self._tracker.T_odom_base(T_local_base)
-
     def begin_local_map(self) -> None:
         """Forget the surfaces seen so far. The next keyscan is tied to the one before by odometry alone."""
-        self._tracker.empty_buffer()
+        self.tracker.empty_buffer()
         self._recent.clear()
         self._begun_m = self.travel_m
 
@@ -230,7 +221,7 @@ class LidarFrontend:
         points = tracked.scan
         if points is None or sweep is not None:
             points = point_scan(scan.matched_ranges_m, scan.laser, sweep)
-        self._tracker.insert(points, tracked.T_local_base, len(self.lasers))
+        self.tracker.insert(points, tracked.T_local_base, len(self.lasers))
         self._T_local_newest[laser] = tracked.T_local_base
         ranges_m, announced = _valid_ranges(scan.ranges_m, scan.laser.max_range_m), self.lasers[laser]
         beams = None if scan.laser == announced else scan.laser.beams

@@ -46,19 +46,12 @@ class MapAlignment:
 
     T_a_b: FloatArray
     """Shape (3,), metres and radians."""
-    explained_m: float
-    """Distinct surface of one map that lies on surfaces of the other: of both maps, the one with less."""
-    violating_m: float
-    """Surface of one map in free space of the other: of both maps, the one with more."""
+    score_m: float
+    """Metres of distinct surface that lie on surfaces of the other map, net of those in its free space."""
     violation: float
-    """The same as a share of the surface in known area."""
+    """Share of the surface in known area that lies in free space of the other: of both maps, the one with more."""
     known_m: float
     """Surface of one map in known area of the other: of both maps, the one with less."""
-
-    @property
-    def score_m(self) -> float:
-        """Metres of surface that speak for the transform, net of those that speak against it."""
-        return self.explained_m - VIOLATION_WEIGHT * self.violating_m
 
 
 def align_map(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment:
@@ -70,8 +63,8 @@ def align_map(a: Submap, b: Submap, T_a_b: FloatArray) -> MapAlignment:
     known = [side.overlap * len(surface) for side, surface in zip(sides, (b.surface, a.surface), strict=True)]
     violating = [side.violation * count for side, count in zip(sides, known, strict=True)]
     explained_m, violating_m = SPACING_M * min(side.count for side in sides), SPACING_M * max(violating)
-    known_m = SPACING_M * min(known)
-    return MapAlignment(T_a_b, explained_m, violating_m, max(side.violation for side in sides), known_m)
+    score_m = explained_m - VIOLATION_WEIGHT * violating_m
+    return MapAlignment(T_a_b, score_m, max(side.violation for side in sides), SPACING_M * min(known))
 
 
 def alignments(

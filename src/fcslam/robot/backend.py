@@ -41,7 +41,7 @@ from fcslam.records import (
     Tag,
     TagSighting,
 )
-from fcslam.robot.keyframe_folder import KeyframeFolder, KeyframeImage
+from fcslam.robot.keyframe_folder import KeyframeFolder
 from fcslam.robot.tag_detection import TagDetector, TagsConfig
 from fcslam.robot.views import ViewExtractor, ViewsConfig
 from fcslam.wire.messages import Body, Hello
@@ -127,15 +127,10 @@ class RobotBackend:
         self._robot = robot
         self._config = config
         self._folder = None if keyframes is None else KeyframeFolder(keyframes)
-        self._view_extractor = ViewExtractor(robot, config.views, self._folder)
+        self.views = ViewExtractor(robot, config.views, self._folder)
         self._unplaced = 0
         """Keyframes since their poses were written last."""
-        self._session = _Session(robot, 0, self._view_extractor, config)
-
-    @property
-    def keyframes(self) -> tuple[KeyframeImage, ...]:
-        """The images of the present session that the robot still has, oldest first. They stay on the robot."""
-        return self._view_extractor.keyframes
+        self._session = _Session(robot, 0, self.views, config)
 
     def process(self, input: BackendInput) -> list[Body]:
         """Handle the next input; returns what the robot sends because of it.
@@ -165,8 +160,8 @@ class RobotBackend:
                 self._place()
                 if self._folder is not None:
                     self._folder.session += 1
-                self._view_extractor.reset()
-                self._session = _Session(self._robot, self._session.epoch + 1, self._view_extractor, self._config)
+                self.views.reset()
+                self._session = _Session(self._robot, self._session.epoch + 1, self.views, self._config)
                 return rest
         return []
 
@@ -180,8 +175,8 @@ class RobotBackend:
             raise FeatureError(
                 f"{file.version}: describes {file.channel} places; this robot does not use detectors of that channel"
             )
-        if file.version != self._view_extractor.detector_version:
-            self._view_extractor.set_detector(file, path)
+        if file.version != self.views.detector_version:
+            self.views.set_detector(file, path)
 
 
 class _Session:

@@ -196,7 +196,7 @@ class PredictedMotion:
         if found is None or not is_in_reach(found, scans[0], frontend, gap_s):
             is_elsewhere = found is not None and not gap_s
             return not (is_elsewhere or gap_s > SEEN_S or is_unplaced(scans[0], frontend))
-        T = se2.compose(frontend.T_odom_base(found), se2.inverse(scans[0].T_odom_base))
+        T = se2.compose(frontend.tracker.T_odom_base(found), se2.inverse(scans[0].T_odom_base))
         self._prediction.move(T)
         for number, record in enumerate(deferred):
             if isinstance(record, LaserScan):

@@ -87,7 +87,7 @@ class Session:
     def drove_on(self, scans: list[LaserScan]) -> bool:
         """Whether odometry without a jump and the scans agree that the robot drove to where doubtful scans are."""
         is_measured = self.motion.model.is_measured and self.motion.jumps == self._jumps
-        return is_measured and drove_on(self._explained, scans, self.lidar.odometry, self.lidar.trust)
+        return is_measured and drove_on(self._explained, scans, self.lidar.odometry, self.lidar.tracker.trust)
 
     def map(self, scan: LaserScan, tracking: TrackingResult, fixes: Iterable[GnssFix]) -> list[BackendInput]:
         """Continue from a localized scan; returns the keyscan that it becomes, and the fixes of keyscans."""

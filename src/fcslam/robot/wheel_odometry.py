@@ -81,8 +81,6 @@ class WheelOdometry:
         """Whether it says anything."""
         self.jumps = 0
         """Number of jumps so far."""
-        self.largest_m = 0.0
-        """Length of the largest one, metres."""
         self._last: tuple[float, FloatArray] | None = None
         """Stamp and pose, as it was read, of the scan before."""
         self._bridge: FloatArray | None = None
@@ -104,7 +102,6 @@ class WheelOdometry:
             moved_m = math.hypot(x, y)
             if is_jump(motion, scan.stamp - stamp):
                 self.jumps += 1
-                self.largest_m = max(self.largest_m, moved_m)
                 self._bridge = se2.compose(se2.compose(self.bridged(before), self._motion), se2.inverse(read))
             elif moved_m > LEAST_BRIDGE_M or abs(turn) > LEAST_BRIDGE_RAD:
                 self._motion = motion
