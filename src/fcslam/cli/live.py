@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,8 +71,7 @@ def drive_live(
     sys.setswitchinterval(0.001)  # a thread that publishes yields to the one that maps; Python's own is 5 ms
     logging.getLogger("fcslam.live").addHandler(logging.NullHandler())  # its events are printed below
 
-    def notify(line: str) -> None:
-        print_line(console, line)
+    notify = partial(print_line, console)
 
     def print_event(event: "RobotEvent") -> None:
         if event.kind is not EventKind.CORRECTED:  # there are many

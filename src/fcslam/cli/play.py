@@ -120,23 +120,19 @@ def _learn(
 ) -> None:
     from fcslam.learning.federated.learning_process import LearningProcess
 
-    def notify(line: str) -> None:
-        print_line(console, line)
-
+    notify = partial(print_line, console)
     notify("the drive is over; the robot learns with its fleet until Ctrl-C")
-    learning = LearningProcess(plan, robot.name, notify)
-    began_s = time.monotonic()
-    try:
-        learning.set_idle(True)
-        while (passed_s := time.monotonic() - began_s) < plan.settings.time_s and not learning.has_ended:
-            robot.idle()
-            watch(robot.status())
-            display.show("learning", round(passed_s), round(plan.settings.time_s))
-            time.sleep(0.5)
-    except KeyboardInterrupt:
-        notify("learning ends; the robot sends what is left")
-    finally:
-        learning.close()
+    with closing(LearningProcess(plan, robot.name, notify)) as learning:
+        began_s = time.monotonic()
+        try:
+            learning.set_idle(True)
+            while (passed_s := time.monotonic() - began_s) < plan.settings.time_s and not learning.has_ended:
+                robot.idle()
+                watch(robot.status())
+                display.show("learning", round(passed_s), round(plan.settings.time_s))
+                time.sleep(0.5)
+        except KeyboardInterrupt:
+            notify("learning ends; the robot sends what is left")
 
 
 def _fingerprint(name: str, survey: "Survey", settings: "RobotConfig", budget_kBps: float | None, floor: str) -> str:

@@ -50,11 +50,7 @@ class KeypointNetwork(nn.Module):
         """The encoder and its heads. Its ``code_inputs`` (B, C, H/8, W/8) of images give ``describe`` the codes."""
 
     def forward(self, image: Tensor) -> Maps:
-        """Maps of a batch.
-
-        Raises:
-            ValueError: height or width is not a multiple of 8.
-        """
+        """Maps of a batch of images whose height and width are multiples of 8."""
         if image.shape[-1] % CELL_PX or image.shape[-2] % CELL_PX:
             raise ValueError(f"sides must be multiples of {CELL_PX}, not {tuple(image.shape[-2:])}")
         maps: Maps = self.body(image)

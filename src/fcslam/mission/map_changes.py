@@ -19,7 +19,7 @@ from fcslam.maps.changes import APPEARED, DISAPPEARED, Changes, compare
 from fcslam.maps.fusion import Period, fuse_periods, periods_of
 from fcslam.maps.occupancy_map import OccupancyMap, server_files
 from fcslam.mission.mission_file import SavedMission
-from fcslam.records import FloatArray, Keyscan, LaserModel
+from fcslam.records import SAME_STAMP_S, FloatArray, Keyscan, LaserModel
 from fcslam.runs import Run
 from fcslam.storage.files import replacing_folder
 from fcslam.wire.messages import Hello
@@ -27,8 +27,6 @@ from fcslam.wire.messages import Hello
 TABLE: Final = "changes.csv"
 PICTURE: Final = "changes.png"
 COLUMNS: Final = ("change", "area_m2", "x", "y", "sessions")
-STAMP_TOLERANCE_S: Final = 1e-6
-"""Trajectories hold stamps with nine digits after the decimal point."""
 
 
 class _Seen(NamedTuple):
@@ -113,7 +111,7 @@ def _seen(run: Run, mission: SavedMission, map_index: int, name: str) -> _Seen:
         raise SourceError(f"{name}: has no map {map_index}; the first one is 0")
 
     def is_mapped(keyscan: Keyscan) -> bool:
-        return bool(keyscan.stamp <= members[keyscan.id.robot].stamps.max() + STAMP_TOLERANCE_S)
+        return bool(keyscan.stamp <= members[keyscan.id.robot].stamps.max() + SAME_STAMP_S)
 
     lasers: dict[str, Sequence[LaserModel]] = {}
     keyscans: list[Keyscan] = []
@@ -133,8 +131,8 @@ def _seen(run: Run, mission: SavedMission, map_index: int, name: str) -> _Seen:
     for keyscan in keyscans:
         robot, order = members[keyscan.id.robot], stamps[keyscan.id.robot]
         sorted_stamps = robot.stamps[order]
-        k = min(int(np.searchsorted(sorted_stamps, keyscan.stamp - STAMP_TOLERANCE_S)), len(order) - 1)
-        if k < 0 or abs(sorted_stamps[k] - keyscan.stamp) > STAMP_TOLERANCE_S:
+        k = min(int(np.searchsorted(sorted_stamps, keyscan.stamp - SAME_STAMP_S)), len(order) - 1)
+        if k < 0 or abs(sorted_stamps[k] - keyscan.stamp) > SAME_STAMP_S:
             raise SourceError(f"{name}: the trajectory of {keyscan.id.robot} has no pose at {keyscan.stamp:.6f} s")
         poses.append(robot.T_map_base[order[k]])
     return _Seen(keyscans, np.array(poses).reshape(-1, 3), lasers)

@@ -7,7 +7,6 @@ from pathlib import Path
 from fcslam.features.detector_file import describe_detector_file
 from fcslam.records import PLACE_CHANNELS, Channel, DetectorFile
 
-LONGEST_FILE_BYTES = 64 * 2**20
 STAGING = ".staging"
 """Prefix of folders with networks that are not checked yet."""
 _ANNOUNCED = "announced"

@@ -48,11 +48,7 @@ def layers_of(mission: ViewedMission, k: int) -> list[MapLayer]:
 
 
 def map_shapes(mission: ViewedMission, k: int, layer: MapLayer) -> list[MapShape]:
-    """A layer of map ``k``; empty if there is nothing to draw.
-
-    Raises:
-        InputError: a file of the run is broken or too large.
-    """
+    """A layer of map ``k``; empty if there is nothing to draw."""
     folder = mission.run_folder
     if folder is None or layer not in layers_of(mission, k):
         return []

@@ -10,10 +10,10 @@ from hypothesis.extra import numpy as arrays
 
 pytest.importorskip("torch", reason="needs fcslam[federated]")
 
+from fcslam.config import LONGEST_QUOTE
 from fcslam.errors import InputError
 from fcslam.learning.federated.client import InProcessFleet
 from fcslam.learning.federated.messages import (
-    MAX_REASON_LENGTH,
     TrainingReply,
     TrainingRequest,
     read_reply,
@@ -98,7 +98,7 @@ def test_reasons_are_short_lines(tmp_path):
         return replace(reply, error="\x1b[2J\n" + "a" * 200_000)
 
     _, reports = run(fleet(), tmp_path, fleet=TwistedFleet(fleet(), shout))
-    assert {len(report.left_out["bad"]) for report in reports} == {MAX_REASON_LENGTH}
+    assert {len(report.left_out["bad"]) for report in reports} == {LONGEST_QUOTE}
     assert all(report.left_out["bad"].isprintable() for report in reports)
 
 

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from fcslam.config import one_line
 from fcslam.errors import InputError
 from fcslam.learning.federated.aggregation import Aggregate, average, next_weights
 from fcslam.learning.federated.checkpoint import CoordinatorState, read_checkpoint, run_id, write_checkpoint
@@ -26,7 +27,6 @@ from fcslam.learning.federated.messages import (
     TrainingRequest,
     checked_reply,
     collect_updates,
-    printable_line,
 )
 from fcslam.learning.federated.rounds import ROUNDS_FILE, Evaluation, RoundReport, write_rows
 from fcslam.learning.federated.screening import BOUNDS, ScreeningBounds, screen, update_length
@@ -217,7 +217,7 @@ class Coordinator:
             try:
                 found[robot] = check_judgement(checked_reply(reply, robot, request.version).arrays.get(PAIRS))
             except ValueError as error:
-                replies.left_out.setdefault(f"judging by {robot}", printable_line(str(error)))
+                replies.left_out.setdefault(f"judging by {robot}", one_line(str(error)))
         return found
 
     def _wait_or_fail(self, reason: str) -> None:

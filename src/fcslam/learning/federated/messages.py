@@ -12,7 +12,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.errors import InputError, printable
+from fcslam.config import one_line
+from fcslam.errors import InputError
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, size_bytes
 
@@ -23,8 +24,6 @@ MAX_FIGURES: Final = 32
 """A reply with more figures than this is refused: fcslam's clients send fewer than ten."""
 LARGEST_FIGURE: Final = 1e6
 """Losses are of the order of 1. A larger one, or one that is not a number, would spoil a mean."""
-MAX_REASON_LENGTH: Final = 300
-"""Longer texts from a robot are cut, so that one robot cannot flood the table of rounds."""
 _LENGTH_BYTES: Final = 4
 
 
@@ -159,15 +158,9 @@ class RoundReplies:
 
     def leave_out(self, robot: str, reason: str) -> None:
         """Remove a robot's update from the round."""
-        self.left_out[robot] = printable_line(reason)
+        self.left_out[robot] = one_line(reason)  # cut, so that one robot cannot flood the table of rounds
         for kept in (self.weights, self.losses):
             kept.pop(robot, None)
-
-
-def printable_line(text: str) -> str:
-    """The text as one printable line of at most ``MAX_REASON_LENGTH`` characters."""
-    words = " ".join(printable(text).split())
-    return words if len(words) <= MAX_REASON_LENGTH else f"{words[: MAX_REASON_LENGTH - 3]}..."
 
 
 def collect_updates(replies: Mapping[str, TrainingReply], asked: Collection[str], version: str) -> RoundReplies:

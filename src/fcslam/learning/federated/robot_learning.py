@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fcslam.config import one_line
 from fcslam.errors import FcslamError, InputError, UnavailableError
 from fcslam.features.detector import GreyImage, decode_grey, padded
 from fcslam.geometry import se2
@@ -35,7 +36,7 @@ from fcslam.learning.federated.client import Client, RevisitClient, reply_to
 from fcslam.learning.federated.fleet_server import ANSWER_S, NUMBER_HEADER, RETRY_S
 from fcslam.learning.federated.held_out import HeldOutPairs
 from fcslam.learning.federated.learning_process import NOTICE
-from fcslam.learning.federated.messages import TrainingReply, printable_line, read_request, write_reply
+from fcslam.learning.federated.messages import TrainingReply, read_request, write_reply
 from fcslam.learning.federated.settings import RobotLearningSettings
 from fcslam.learning.revisits import Keyframe, revisits_in_map
 from fcslam.processes import emit_event
@@ -125,7 +126,7 @@ def serve_requests(
         except InputError as error:
             reply = TrainingReply(link.robot, "", error=str(error))
         if reply.error:
-            on_notice(f"refused: {printable_line(reply.error)}")
+            on_notice(f"refused: {one_line(reply.error)}")
         reason = retried(partial(link.reply, number, write_reply(reply)))
         if reason:
             on_notice(f"the server does not take a reply: {reason}")
