@@ -231,12 +231,12 @@ class MissionStore:
     def newest_hello(self, robot: str, epoch: int) -> Hello | None:
         """The session's newest hello."""
         where = "robot = ? AND epoch = ? AND kind = 'hello' AND refusal IS NULL"
-        return _first(self._bodies(Hello, f"{where} ORDER BY sequence DESC LIMIT 1", robot, epoch))
+        return next(iter(self._bodies(Hello, f"{where} ORDER BY sequence DESC LIMIT 1", robot, epoch)), None)
 
     def newest_keyscan(self, robot: str, epoch: int) -> Keyscan | None:
         """The session's newest keyscan."""
         where = "robot = ? AND epoch = ? AND kind = ? AND refusal IS NULL ORDER BY sequence DESC LIMIT 1"
-        return _first(self._bodies(Keyscan, where, robot, epoch, PacketKind.KEYSCAN))
+        return next(iter(self._bodies(Keyscan, where, robot, epoch, PacketKind.KEYSCAN)), None)
 
     def keyscans_near(self, robot: str, epoch: int, time: float, limit: int) -> list[Keyscan]:
         """At most ``limit`` keyscans of a session that it sent nearest to a time."""
@@ -545,10 +545,6 @@ def _track(stamps: bytes, keyscans: bytes, offsets: bytes) -> Track:
     if len(track.keyscans) and (track.keyscans.min() < 0):
         raise ValueError("a keyscan has a negative number")
     return track
-
-
-def _first(bodies: list[_Body]) -> _Body | None:
-    return bodies[0] if bodies else None
 
 
 def _packet(
