@@ -64,10 +64,8 @@ UNPACKED = 4 * MOST_CANDIDATES
 """Submaps that are kept ready for comparison, 0.2 MB each."""
 SIMILAR_PLACES = 6 * MOST_CANDIDATES
 """Most similar earlier submaps among which the places to compare are chosen."""
-WIDEST_M = 15.0
-"""Largest half side of the search window, metres."""
-WIDEST_RAD = 0.7
-"""Largest half angle of the search window, radians."""
+WIDEST_M, WIDEST_RAD = 15.0, 0.7
+"""Largest half side and half angle of the search window, metres and radians."""
 LEAST_SCORE = 0.5
 """Least mean likelihood of the points that a search must reach."""
 RECOGNIZED_DRIFT = 0.25

@@ -49,7 +49,6 @@ class SearchResult:
     """Best pose of a search."""
 
     T_field_base: FloatArray
-    """Shape (3,), metres and radians."""
     score: float
     """Mean likelihood of the points, in [0, 1], without the penalty."""
 

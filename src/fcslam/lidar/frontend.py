@@ -108,7 +108,6 @@ class ScanPose(NamedTuple):
     stamp: float
     keyscan: int
     T_keyscan_base: FloatArray
-    """Shape (3,), metres and radians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

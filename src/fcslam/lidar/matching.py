@@ -58,13 +58,11 @@ class ScanMatch(NamedTuple):
     """Pose of a scan in a field."""
 
     T_field_base: FloatArray
-    """Shape (3,), metres and radians."""
     information: FloatArray
     """Information of the points without the prior, over (x, y) in the field and theta, shape (3, 3)."""
     explained: float
-    """Share of the scan's points that lie on a surface."""
     known: float
-    """Share of the scan's points that fall near any surface."""
+    """Shares of the scan's points that lie on a surface, and that fall near any."""
     log_likelihoods: FloatArray
     """Log-likelihood of each point, relative to one on no surface, shape (N,).
 

@@ -90,11 +90,8 @@ class VerificationPool:
 
     A submap takes longer to send than to compare. Each process keeps those that it got, by a hash of their content.
 
-    Args:
-        processes: the other processes that take batches now, each of which runs its tasks one by one.
-        batch: pairs in a batch.
-        patience_s: time after which a batch is repeated.
-        rest_s: time for which a process that failed gets no batch.
+    ``processes`` gives the other processes that take batches now, each of which runs its tasks one by one; the other
+    arguments are explained at their defaults.
     """
 
     def __init__(

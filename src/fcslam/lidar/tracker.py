@@ -61,7 +61,6 @@ class TrackedScan(NamedTuple):
     """One scan's pose in the tracker's own smooth frame."""
 
     T_local_base: FloatArray
-    """Shape (3,), metres and radians."""
     information: FloatArray
     """Information of the scan's points, over (x, y) in the local frame and theta, shape (3, 3); zeros if odometry alone
     gives the pose."""
@@ -79,9 +78,8 @@ class TrackerState(NamedTuple):
     T_odom_base: FloatArray | None = None
     """The same by wheel odometry; None before the first scan."""
     moved_m: float = 0.0
-    """Travel since the last accepted match, by odometry."""
     turned_rad: float = 0.0
-    """Turn since the last accepted match, by odometry."""
+    """Travel and turn since the last accepted match, by odometry."""
     matched_here: frozenset[tuple[float, float, float]] = frozenset()
     """Mountings of the lasers whose scans were matched since the robot last moved."""
     trust: OdometryTrust = OdometryTrust()

@@ -45,7 +45,6 @@ class MapAlignment:
     """How well two maps fit at one transform."""
 
     T_a_b: FloatArray
-    """Shape (3,), metres and radians."""
     score_m: float
     """Metres of distinct surface that lie on surfaces of the other map, net of those in its free space."""
     violation: float

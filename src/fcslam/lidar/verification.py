@@ -68,7 +68,6 @@ class Verification:
     """Result of aligning submap b with submap a."""
 
     T_a_b: FloatArray
-    """Shape (3,), metres and radians."""
     information: FloatArray
     """Information of T_a_b in the tangent space at T_a_b (coordinates of b), shape (3, 3)."""
     worse: Agreement

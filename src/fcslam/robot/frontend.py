@@ -192,8 +192,11 @@ class RobotFrontend:
     def _process_scan(self, scan: LaserScan) -> None:
         motion = self.motion
         if isinstance(motion, PredictedMotion) and motion.awaits_second(scan):
-            if not self._deferred:
-                self._await_second(scan)
+            if not self._deferred:  # the second scan shows the motion during this one
+                tracked = TrackedScan(np.zeros(3), np.zeros((3, 3)), None, scan.sweep)
+                self.newest = NewestScan(ScanPose(scan.stamp, 0, se2.IDENTITY), tracked, math.nan, is_deferred=True)
+                self._before = scan
+                self._deferred.records.append(scan)
                 return
             scan = motion.begin(self._deferred.records, scan)
             self._map_deferred()
@@ -209,13 +212,6 @@ class RobotFrontend:
             self._map(deskewed, tracking)
         if self.newest is not None and not self._deferred:
             self._session.observe(scan.stamp, self.newest.pose, self.newest.tracked)
-
-    def _await_second(self, scan: LaserScan) -> None:
-        """Defer the first scan of a robot without odometry: the second one shows the motion during it."""
-        tracked = TrackedScan(np.zeros(3), np.zeros((3, 3)), None, scan.sweep)
-        self.newest = NewestScan(ScanPose(scan.stamp, 0, se2.IDENTITY), tracked, math.nan, is_deferred=True)
-        self._before = scan
-        self._deferred.records.append(scan)
 
     def _bridge_gap(self, scan: LaserScan) -> LaserScan:
         """The scan; where nothing shows the motion to it, it begins a session, or is predicted and doubtful."""

@@ -54,10 +54,8 @@ LOST_IN_FREE_SPACE = 2.0 * MOST_IN_FREE_SPACE
 (``LOST_VIOLATION``): a finished map has no error of the robot's newest poses."""
 LARGEST_UNSEEN_M = 20.0
 """Travel without known walls after which the robot is not localized any more, metres."""
-INITIAL_ERROR_M = 1.5
-"""Largest error of a given initial position, metres."""
-INITIAL_ERROR_RAD = 0.5
-"""Largest error of a given initial heading, radians."""
+INITIAL_ERROR_M, INITIAL_ERROR_RAD = 1.5, 0.5
+"""Largest error of a given initial pose, metres and radians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
