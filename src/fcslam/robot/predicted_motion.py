@@ -180,7 +180,7 @@ class PredictedMotion:
         if self._own_map is None:
             scan = self.begin(deferred, scan, origin)
             self._own_map = frontend.fresh()
-            self._own_map.process(_scans(deferred)[0])
+            self._own_map.process(scans_of(deferred)[0])
         scan, own = self.track(scan, self._own_map, lambda tracked: se2.compose(origin, tracked.T_local_base))
         scan = self._prediction.follow(scan, se2.compose(origin, own.tracked.T_local_base), own.tracked.sweep)
         self._own_map.process(scan, own._replace(state=own.state._replace(T_odom_base=scan.T_odom_base)))
@@ -191,7 +191,7 @@ class PredictedMotion:
 
         ``gap_s`` is the time before them in which nothing shows the motion; 0: there was no gap.
         """
-        scans = _scans(deferred)
+        scans = scans_of(deferred)
         found = relocated(scans, frontend)
         if found is None or not is_in_reach(found, scans[0], frontend, gap_s):
             is_elsewhere = found is not None and not gap_s
@@ -204,5 +204,6 @@ class PredictedMotion:
         return True
 
 
-def _scans(deferred: Deferred) -> list[LaserScan]:
+def scans_of(deferred: Deferred) -> list[LaserScan]:
+    """The scans among deferred records."""
     return [record for record in deferred if isinstance(record, LaserScan)]

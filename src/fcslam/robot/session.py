@@ -30,7 +30,7 @@ from fcslam.lidar.lost import (
 from fcslam.lidar.tracker import DOUBTFUL, TrackedScan, TrackingResult
 from fcslam.records import CameraImage, FloatArray, GnssFix, KeyscanFix, KeyscanId, LaserScan, Sweep
 from fcslam.robot.backend import BackendInput, NewImage, NewKeyscan
-from fcslam.robot.predicted_motion import Deferred, PredictedMotion
+from fcslam.robot.predicted_motion import Deferred, PredictedMotion, scans_of
 from fcslam.robot.track import ScanTrack
 from fcslam.robot.wheel_odometry import WheelOdometry, moving_on
 
@@ -174,16 +174,16 @@ class DeferredScans:
         travel_m, most = GAP_TRAVEL_M if self.gap_s else DOUBTFUL_TRAVEL_M, MOST_SCANS
         if self.cabin.is_leaving:
             travel_m, most = LEAVING_M, LEAVING_SCANS
-        return not session.motion.may_be_frozen and can_decide(self._scans, travel_m, most)
+        return not session.motion.may_be_frozen and can_decide(scans_of(self.records), travel_m, most)
 
     @property
     def must_decide(self) -> bool:
         """Whether the scans are compared even if no more follow: only after a gap, if there are two."""
-        return self.gap_s > 0.0 and len(self._scans) > 1
+        return self.gap_s > 0.0 and len(scans_of(self.records)) > 1
 
     def decide(self, session: Session) -> Outcome:
         """Compare the scans with the newest keyscans of the session; scans that are found elsewhere are moved there."""
-        lidar, gap_s, scans = session.lidar, self.gap_s, self._scans
+        lidar, gap_s, scans = session.lidar, self.gap_s, scans_of(self.records)
         if self.cabin.is_leaving and not gap_s:
             return Outcome.OTHER_FLOOR if is_lost(scans, lidar, self.cabin.closed_s) else Outcome.SAME_PLACE
         if not gap_s and is_lost(scans, lidar):
@@ -195,7 +195,3 @@ class DeferredScans:
         """End the deferral; returns the records."""
         records, self.records, self.gap_s = self.records, [], 0.0
         return records
-
-    @property
-    def _scans(self) -> list[LaserScan]:
-        return [record for record in self.records if isinstance(record, LaserScan)]
