@@ -30,7 +30,7 @@ and a log-likelihood higher by ``JUMP_GAIN``."""
 LARGEST_VELOCITY = 30.0
 """Largest velocity of a robot in a sweep, m/s and rad/s: a match that says more is wrong."""
 PRIOR_SCALE = 3.0
-"""Standard deviation of odometry as the prior of a match, per learned one: points count fully in the matcher."""
+"""Standard deviation of the position in the prior of a match, per learned one: points count fully in the matcher."""
 UNSURE_M = 0.05
 """Learned standard deviation of odometry, in metres, beyond which a match has several starts. After a long step a match
 may end at a maximum of the likelihood that is nearer to odometry than the right one."""
@@ -241,10 +241,8 @@ class ScanTracker:
         if self._is_unsure(error):
             match = _likeliest(thinned, field, T_local_guess, learned, velocity)
         else:
-            prior = OdometryError(
-                min(error.position_m, PRIOR_SCALE * learned.position_m),
-                min(error.heading_rad, PRIOR_SCALE * learned.heading_rad),
-            )
+            # Walls give the heading nearly everywhere, the position not: along a bare one only wheels do.
+            prior = OdometryError(min(error.position_m, PRIOR_SCALE * learned.position_m), error.heading_rad)
             tail = PRIOR_TAIL if self._state.trust.matches >= FIRST_MATCHES else math.inf
             match = match_scan(thinned, field, T_local_guess, prior.information, velocity, prior_tail=tail)
         innovation = se2.motion(T_local_guess, match.T_field_base)
