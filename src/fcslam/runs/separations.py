@@ -97,11 +97,15 @@ def _end_in(run: Run, closure: ClosureRow, robots: tuple[str, ...]) -> tuple[flo
 
 
 def _typical(closures: list[ClosureRow]) -> ClosureRow:
-    """The first with the most frequent reason, of the two robots with the most closures."""
+    """The first with the most frequent reason, of the two robots with the most closures.
+
+    A veto goes before all others: without it, the closures that are left might be enough.
+    """
     pairs = Counter(frozenset((closure.robot_i, closure.robot_j)) for closure in closures)
     strongest = pairs.most_common(1)[0][0]
     between = [closure for closure in closures if {closure.robot_i, closure.robot_j} == strongest]
-    reason = Counter(closure.reason for closure in between).most_common(1)[0][0]
+    reasons = Counter(closure.reason for closure in between)
+    reason = max(reasons, key=lambda reason: (reason.code is ReasonCode.VETOED, reasons[reason]))
     return next(closure for closure in between if closure.reason == reason)
 
 
