@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fcslam.geometry import se2
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.matching import FIXED, ScanMatch, match_scan
-from fcslam.lidar.odometry import OdometryError
+from fcslam.lidar.odometry import PRIOR_TAIL, OdometryError
 from fcslam.lidar.scan import PointScan
 from fcslam.records import FloatArray
 
@@ -86,10 +86,12 @@ def resolve(
     is_clear = is_seen and match.explained >= CLEAR * match.known
     if distance2 < NEAR**2 or (is_clear and not is_far):
         return match, False
-    trusting = match_scan(scan, field, T_field_guess, CORRELATED * error.information, velocity_information)
+    prior = CORRELATED * error.information
+    trusting = match_scan(scan, field, T_field_guess, prior, velocity_information)
     gains = surface_gains(scan, match.log_likelihoods - trusting.log_likelihoods)
     if is_far and is_seen and gains.max(initial=0.0) <= SURFACE_NATS:  # no surface alone pulls the match: wheels slip
-        return match, False
+        trusting = match_scan(scan, field, T_field_guess, prior, velocity_information, prior_tail=PRIOR_TAIL)
+        gains = surface_gains(scan, match.log_likelihoods - trusting.log_likelihoods)
     gain = float(np.clip(gains, -SURFACE_NATS, SURFACE_NATS).sum())
     gain += error.log_likelihood(innovation)
     gain -= error.log_likelihood(se2.motion(T_field_guess, trusting.T_field_base))
