@@ -137,7 +137,7 @@ class Report:
         self._folder: Path = chosen.results
         self._setting = {
             "date": chosen.date,
-            "command": " ".join([f"python benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
+            "command": " ".join([f"python benchmarks/{Path(sys.argv[0]).name}", *map(_without_folders, sys.argv[1:])]),
         }
         self._setting |= machine()
         self._parts: list[str] = []
@@ -178,6 +178,11 @@ class Report:
                 file.write(f"\n# {title}\n" if number else f"# {title}\n")
                 csv.writer(file, lineterminator="\n").writerows(rows)
         print(text)
+
+
+def _without_folders(argument: str) -> str:
+    """An argument as a reader may repeat it: absolute paths name folders of one machine."""
+    return f"/path/to/{Path(argument).name}" if argument.startswith("/") else argument
 
 
 def figures(path: Path, title: str) -> list[dict[str, str]]:

@@ -3,6 +3,7 @@
 import ast
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -92,3 +93,15 @@ def test_the_command_is_measured_and_its_failure_ends_the_script():
 @pytest.fixture
 def camera_detectors():
     return load(FOLDER / "camera_detectors.py")
+
+
+def test_commands_of_reports_name_no_folder_of_one_machine():
+    results = FOLDER / "results"
+    commands = [
+        (report.name, line)
+        for report in results.glob("*.md")
+        for line in report.read_text(encoding="utf-8").splitlines()
+        if line.startswith("- command:")
+    ]
+    assert commands
+    assert [each for each in commands if re.search(r" /(?!path/to/)", each[1])] == []
