@@ -60,7 +60,7 @@ TRAINING = {"label_copies": 4, "pairs": 2, "side_px": 128, "learning_rate": 3e-3
 FEDERATED = {"rounds": ROUNDS, "local_steps": STEPS, "training": TRAINING}
 WIDE = TRAINING | {"pairs": 10, "learning_rate": 6e-3}
 """In one step what five robots take together."""
-TRUSTING = RoundRules(bounds=ScreeningBounds(math.inf, math.inf, -math.inf, math.inf))
+TRUSTING = RoundRules(bounds=ScreeningBounds(math.inf, math.inf, -math.inf, math.inf, clips=False))
 ROBUST: dict[str, dict[str, Any]] = {
     "fedavg": {"rules": TRUSTING},
     "screened": {},

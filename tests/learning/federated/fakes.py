@@ -18,7 +18,7 @@ START = {
     "a.running_var": np.ones(2, np.float32),
     "b.weight": np.full((), 0.5, np.float32),
 }
-LENIENT = ScreeningBounds(math.inf, math.inf, -math.inf, math.inf)
+LENIENT = ScreeningBounds(math.inf, math.inf, -math.inf, math.inf, clips=False)
 PLAIN = RoundRules(bounds=LENIENT, momentum=0.0, smoothing=0.0, judge_every=1)
 
 

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import httpx
 import numpy as np
@@ -102,6 +103,29 @@ def test_a_poisoned_update_changes_nothing(poison, undisturbed, tmp_path):
     assert all(np.isfinite(list(report.losses.values())).all() for report in reports)
     for name, array in undisturbed.items():
         assert np.array_equal(state.weights[name], array), name
+
+
+@pytest.mark.parametrize("length", [1.0, 3.0, 5.9])
+def test_a_robot_of_three_moves_the_weights_by_its_share_however_long_its_updates_are(length, tmp_path):
+    """It goes in a direction of its own, in which screening sees nothing odd: as far as the honest ones in theirs."""
+    own = np.random.default_rng(5).normal(size=COMMON.shape)
+    common, own = (each / np.linalg.norm(each) for each in (COMMON, own))
+
+    def answer_of(seed):
+        def answer(weights, round_number):
+            noise = np.random.default_rng([seed, round_number]).normal(size=COMMON.shape)
+            return {"a.weight": (weights["a.weight"] + 0.4 * common + 0.9 * noise / 80.0).astype(np.float32)}
+
+        return answer
+
+    def hostile(weights, _):
+        return {"a.weight": (weights["a.weight"] + length * own).astype(np.float32)}
+
+    start = {"a.weight": 10.0 * WEIGHTS["a.weight"]}
+    robots = [Fake("one", answer=answer_of(1)), Fake("two", answer=answer_of(2)), Fake(HOSTILE, answer=hostile)]
+    state, _ = run(robots, tmp_path, settings(rounds=20), start=start, rules=replace(RULES, momentum=0.0))
+    moved = state.weights["a.weight"] - start["a.weight"]
+    assert (moved * own).sum() < 1.2 * (moved * common).sum()
 
 
 def test_a_robot_that_sends_noise_is_left_out(undisturbed, tmp_path):

@@ -12,8 +12,17 @@ Aggregate = Callable[[int, Sequence[Weights]], Weights]
 """Gives the weights of a round, counted from 1, from those of its robots."""
 
 
+FEWEST_FOR_MEAN = 5
+"""Fewest updates of which the mean is taken; of fewer, one that is false would have too large a share."""
+
+
 def average(_round_number: int, updates: Sequence[Weights]) -> Weights:
-    """Federated averaging: the mean. Every robot did the same number of steps, so every update has the same weight."""
+    """Federated averaging: the mean; under five robots the median of each weight.
+
+    Every robot did the same number of steps, so every update has the same weight.
+    """
+    if len(updates) < FEWEST_FOR_MEAN:
+        return {name: np.median(np.stack([each[name] for each in updates]), axis=0) for name in updates[0]}
     share = 1.0 / len(updates)
     return {name: sum((each[name] * share for each in updates[1:]), updates[0][name] * share) for name in updates[0]}
 

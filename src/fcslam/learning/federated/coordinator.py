@@ -29,7 +29,7 @@ from fcslam.learning.federated.messages import (
     collect_updates,
 )
 from fcslam.learning.federated.rounds import ROUNDS_FILE, Evaluation, RoundReport, write_rows
-from fcslam.learning.federated.screening import BOUNDS, ScreeningBounds, screen, update_length
+from fcslam.learning.federated.screening import BOUNDS, ScreeningBounds, clip, screen, update_length
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights, interpolate_weights, size_bytes
 from fcslam.learning.training_loop import learning_rate
@@ -181,6 +181,7 @@ class Coordinator:
         refused = screen(replies.weights, state.weights, self._rules.bounds, frozen, state.update_length)
         for robot, reason in refused.items():
             replies.leave_out(robot, reason)
+        replies.weights = clip(replies.weights, state.weights, self._rules.bounds)
         return replies, state
 
     def _average(self, weights: Weights, state: CoordinatorState) -> Weights:

@@ -1,6 +1,7 @@
 """Screening: decides which updates of a round are aggregated.
 
 An update must fit the network, have a plausible length, batch statistics like those of the others, and not oppose them.
+Of those that are aggregated, long ones are shortened.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,7 @@ from fcslam.learning.federated.weights import (
     VARIANCE,
     FloatVector,
     Weights,
+    interpolate_weights,
     parameter_names,
     update_vector,
     weights_error,
@@ -45,6 +47,8 @@ class ScreeningBounds:
     statistics_distance: float = 0.4
     """Of the distance of batch statistics from the median of three robots or more, in standard deviations, root mean
     square over the channels."""
+    clips: bool = True
+    """Whether longer updates than the median of a round are shortened to it, so that none counts for several."""
 
 
 BOUNDS: Final = ScreeningBounds()
@@ -76,6 +80,20 @@ def screen(
         refused |= _too_long(rest, float(np.linalg.norm(_vector(sent, names))), earlier, bounds)
     refused |= _odd_statistics(updates, refused, bounds)
     return refused | _disagreeing(_vectors(updates, sent, parameters, refused), bounds)
+
+
+def clip(updates: Mapping[str, Weights], sent: Weights, bounds: ScreeningBounds) -> dict[str, Weights]:
+    """The accepted updates of a round, none longer than the median (of an even number, the shorter of the two in the
+    middle). Batch statistics are not changed.
+    """
+    names = parameter_names(sent)
+    lengths = {robot: float(np.linalg.norm(each)) for robot, each in _vectors(updates, sent, names, {}).items()}
+    limit = sorted(lengths.values())[(len(lengths) - 1) // 2] if bounds.clips and lengths else np.inf
+    clipped = dict(updates)
+    for robot in [robot for robot, length in lengths.items() if length > limit]:
+        shorter = interpolate_weights(updates[robot], sent, limit / lengths[robot])
+        clipped[robot] = {**updates[robot], **{name: shorter[name] for name in names}}
+    return clipped
 
 
 def update_length(updates: Mapping[str, Weights], sent: Weights) -> float:

@@ -18,7 +18,10 @@ class FederatedSettings(Settings):
 
     rounds: int = Field(default=200, ge=1, description="number of rounds of local training and aggregation")
     local_steps: int = Field(default=10, ge=1, description="optimizer steps of each robot in a round")
-    strategy: StrategyName = Field(default="fedavg", description="Flower strategy that aggregates the updates")
+    strategy: StrategyName = Field(
+        default="fedavg",
+        description="Flower strategy that aggregates the updates of `fcslam tools federate`",
+    )
     participation: float = Field(
         default=1.0, gt=0.0, le=1.0, description="share of the connected robots that train in a round"
     )
