@@ -72,7 +72,7 @@ PERCENT = np.where(GREY == 205, 255, np.where(GREY == 0, 100, 0)).astype(np.uint
         (pgm(GREY), {"mode": ""}),
         (pgm(np.round(GREY / 2.55), 100), {}),
         (pgm(GREY.astype(int) * 257, 65535), {}),
-        (ascii_pgm(GREY), {}),
+        (ascii_pgm(GREY).rstrip(), {}),
         (ascii_pgm(GREY.astype(int) * 4, 1020), {}),
         (png(GREY), {}),
         (png(cv2.cvtColor(GREY, cv2.COLOR_GRAY2BGR)), {}),

@@ -233,6 +233,10 @@ def test_a_range_max_that_is_none_is_unknown(tmp_path, range_max):
         ({"range_min": math.inf}, "range_min inf is not below range_max 20"),
         ({"angle_increment": 0.0, "angle_max": 1.0}, "angle_increment is 0"),
         ({"angle_min": math.nan}, "an angle is not finite"),
+        (
+            {"angle_min": -180.0, "angle_increment": 45.0},
+            "8 ranges from angle_min -180 by 45 rad have no field of view, as if in degrees: publish radians)",
+        ),
         ({"ranges": ()}, "0 ranges"),
         ({"payload": b"0"}, "the bytes are not a message of this type"),
         ({"frame": "x" * 300}, "the name of a frame is too long"),
@@ -375,9 +379,7 @@ def test_a_flipped_bag_never_breaks_the_reader(tmp_path, name, data):
 # Files of MCAP that other programs write
 
 
-@pytest.mark.parametrize(("profile", "encoding"), [(b"", b"cdr"), (b"ros1", b"ros1"), (b"ros2", b"cdr")])
-def test_an_mcap_file_without_chunks_or_profile_or_of_ros1(tmp_path, profile, encoding):
-    said = sorted(drive(20), key=lambda message: message.bag_time)
+def mcap_by_another_program(path, said, profile, encoding):
     topics = {message.topic: message.kind for message in said}
     records = [(0x01, counted("<I", profile) + counted("<I", b"test"))]
     for number, (topic, kind) in enumerate(topics.items(), 1):
@@ -389,9 +391,20 @@ def test_an_mcap_file_without_chunks_or_profile_or_of_ros1(tmp_path, profile, en
         time_ns = round(message.bag_time * 1e9)
         head = struct.pack("<HIQQ", list(topics).index(message.topic) + 1, 0, time_ns, time_ns)
         records.append((0x05, head + payload_of(message, is_ros1=encoding == b"ros1")))
-    scans = scans_of(open_source(mcap_file(tmp_path / "run.mcap", [*records, *END])))
+    return mcap_file(path, [*records, *END])
+
+
+@pytest.mark.parametrize(("profile", "encoding"), [(b"", b"cdr"), (b"ros1", b"ros1"), (b"other", b"cdr")])
+def test_an_mcap_file_is_read_by_the_encoding_of_its_channels(tmp_path, profile, encoding):
+    said = sorted(drive(20), key=lambda message: message.bag_time)
+    scans = scans_of(open_source(mcap_by_another_program(tmp_path / "run.mcap", said, profile, encoding)))
     expected = scans_of(open_source(save(tmp_path / "usual.mcap", said)))
     assert [scan.T_odom_base.tolist() for scan in scans] == [scan.T_odom_base.tolist() for scan in expected]
+
+
+def test_an_mcap_file_of_messages_that_are_not_read_is_refused_with_what_to_record(tmp_path):
+    path = mcap_by_another_program(tmp_path / "run.mcap", drive(2), b"", b"json")
+    assert "/odom is not in CDR; record it by `ros2 bag record`; the topics are /odom (nav_msgs/O" in refusal(path)
 
 
 def test_topics_written_one_after_the_other_are_read_in_the_order_of_their_times(tmp_path):

@@ -94,7 +94,8 @@ def decoded_image(image: bytes) -> Any:
     """The pixels as OpenCV reads them, without its messages; None if it cannot read them."""
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_UNCHANGED) if image else None
+        whole = image + b"\n" * image.startswith(b"P2")  # OpenCV needs white space behind the last number
+        return cv2.imdecode(np.frombuffer(whole, np.uint8), cv2.IMREAD_UNCHANGED) if image else None
     except cv2.error:  # more pixels than OpenCV reads
         return None
     finally:

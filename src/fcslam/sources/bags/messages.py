@@ -120,7 +120,11 @@ def _check_angles(count: int, first_rad: float, increment_rad: float, last_rad: 
     if increment_rad == 0.0:
         raise BeamsError("angle_increment is 0")
     if abs(first_rad) > 1.01 * FULL_TURN_RAD or not is_field_of_view(Beams(count, 0.0, increment_rad)):
-        raise BeamsError(f"{count} ranges from angle_min {first_rad:g} by {increment_rad:g} rad have no field of view")
+        is_degrees = is_field_of_view(Beams(count, radians(first_rad), radians(increment_rad)))
+        remedy = ", as if in degrees: publish radians" * is_degrees
+        raise BeamsError(
+            f"{count} ranges from angle_min {first_rad:g} by {increment_rad:g} rad have no field of view{remedy}"
+        )
     stated = (last_rad - first_rad) / increment_rad + 1.0
     if stated < 1.0:
         raise BeamsError("angle_increment leads away from angle_max")

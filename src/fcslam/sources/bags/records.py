@@ -27,6 +27,8 @@ _HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = b"\x01", b"\x03", b"\x
 _ROS1_MESSAGE, _ROS1_CHUNK, _ROS1_CONNECTION = b"\x02", b"\x05", b"\x07"
 _ROS1_MAGIC_BYTES = len(b"#ROSBAG V2.0\n")
 _SQLITE_HEADER_BYTES = 100
+OTHER_ENCODING = " as "
+"""In the types of topics whose messages are not read, before their encoding."""
 
 
 MessagePlace = tuple[int, int, int]
@@ -247,7 +249,7 @@ def _check_database(database: Path) -> None:
 
 def _kind(stated: str, encoding: str) -> str:
     kind = stated.replace("/msg/", "/")
-    return kind if encoding in ("cdr", "ros1") else f"{kind} as {encoding}"
+    return kind if encoding in ("cdr", "ros1") else f"{kind}{OTHER_ENCODING}{encoding}"
 
 
 def _ros1_fields(content: bytes) -> dict[bytes, bytes]:

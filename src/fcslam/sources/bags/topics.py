@@ -19,6 +19,7 @@ from fcslam.sources.bags.codec import (
 )
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
+from fcslam.sources.bags.records import OTHER_ENCODING
 from fcslam.sources.bags.robots import is_truth, slashed
 from fcslam.sources.bags.transforms import last_part
 
@@ -85,6 +86,8 @@ def choose_topics(
         packed = [topic.name for topic in heard if topic.type == COMPRESSED_IMAGE and is_depth(topic.name)]
         bare = [topic.name for topic in heard if topic.type == IMAGE and is_depth(topic.name)]
         remedy = known.remedy
+        if unread := [topic for topic in heard if OTHER_ENCODING in topic.type]:
+            remedy = f"{unread[0].name} is not in CDR; record it by `ros2 bag record`"
         if bare:
             remedy = f"the depth images of {bare[0]} need their {info_beside(bare[0])}"
         if packed:
