@@ -13,7 +13,7 @@ COPY deploy/requirements.lock pyproject.toml README.md LICENSE /src/
 COPY src /src/src
 RUN python3 -m venv /opt/fcslam \
     && /opt/fcslam/bin/pip install --no-cache-dir --no-deps --require-hashes -r /src/requirements.lock \
-    && /opt/fcslam/bin/pip install --no-cache-dir --no-deps /src \
+    && /opt/fcslam/bin/pip install --no-cache-dir --no-deps --no-build-isolation /src \
     && rm -rf /src
 
 # Compiled code is kept here. It is made ahead, and again where the processor is another one.

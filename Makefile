@@ -174,7 +174,7 @@ docs: $(INSTALLED)
 
 # constraints.txt says the versions; this adds the hashes.
 lock: $(INSTALLED)
-	@$(BIN)/uv pip compile -q pyproject.toml --extra service --extra camera --constraint constraints.txt --generate-hashes --no-annotate --no-header \
+	@$(BIN)/uv pip compile -q pyproject.toml --extra service --extra camera --group build --constraint constraints.txt --generate-hashes --no-annotate --no-header \
 	    --python-version 3.11 --python-platform x86_64-manylinux_2_28 --only-binary :all: -o deploy/requirements.lock
 
 sbom: $(INSTALLED)

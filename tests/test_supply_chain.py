@@ -35,6 +35,19 @@ def test_actions_and_the_base_image_are_named_by_their_content():
     assert re.search("@sha256:[0-9a-f]{64}$", base)
 
 
+def test_no_command_of_an_installation_fetches_what_has_no_hash():
+    pages = [ROOT / "Dockerfile", *(ROOT / "docs").rglob("*.md")]
+    lines = [
+        line
+        for page in pages
+        for line in page.read_text("utf-8").splitlines()
+        if "install --no-deps " in line or "--no-cache-dir --no-deps" in line
+    ]
+    assert len(lines) == 6
+    assert [line for line in lines if not re.search("--require-hashes -r|--no-build-isolation", line)] == []
+    assert "setuptools" in pins(REQUIREMENTS)
+
+
 def test_every_dependency_is_among_them():
     project = (
         (ROOT / "pyproject.toml").read_text(encoding="utf-8").partition("\ndependencies = [")[2].partition("\n]")[0]

@@ -20,10 +20,11 @@ needs_dask = pytest.mark.skipif(
 class Cluster:
     """A scheduler and its workers; a context."""
 
-    def __init__(self, folder: Path, scheme: str = "tcp", options: tuple[str, ...] = ()):
+    def __init__(self, folder: Path, scheme: str = "tcp", options: tuple[str, ...] = (), *, start: bool = True):
         self.folder, self.scheme, self.options = folder, scheme, options
         self.processes: list[subprocess.Popen[bytes]] = []
-        self.start_scheduler()
+        if start:
+            self.start_scheduler()
 
     def __enter__(self):
         return self
@@ -38,20 +39,19 @@ class Cluster:
         file = self.folder / "scheduler.json"
         file.unlink(missing_ok=True)
         host = ("--host", f"{self.scheme}://127.0.0.1:{port}")
-        self.scheduler = self._start(
-            "scheduler", *host, "--no-dashboard", "--no-jupyter", "--scheduler-file", str(file)
-        )
+        self.scheduler = self.start("scheduler", *host, "--no-dashboard", "--no-jupyter", "--scheduler-file", str(file))
         self.address = wait_for(lambda: written_address(file))
 
     def start_worker(self, name: str, *options: str, preload: str = ""):
         """Start a worker of one thread; ``preload`` is code that it runs first."""
         preloaded = ("--preload", preload) if preload else ()
-        return self._start(
+        return self.start(
             "worker", self.address, "--name", name, "--nthreads", "1", "--no-dashboard", "--no-nanny",
             "--local-directory", str(self.folder), *preloaded, *options,
         )  # fmt: skip
 
-    def _start(self, kind: str, *options: str):
+    def start(self, kind: str, *options: str):
+        """Start one of Dask's commands."""
         command = (sys.executable, "-m", f"distributed.cli.dask_{kind}", *options, *self.options)
         log = (self.folder / f"{kind}-{len(self.processes)}.log").open("wb")
         with log:

@@ -3,11 +3,15 @@
 import json
 import logging
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +29,7 @@ from fcslam.service.credentials import make_cluster_credentials
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import READY, WorkerTask
 from tests import small_fleet
-from tests.cluster.clusters import Cluster, needs_dask
+from tests.cluster.clusters import Cluster, needs_dask, written_address
 from tests.lidar.test_pair_verification import written
 from tests.mission.test_mission_file import contents
 from tests.waiting import wait_for
@@ -193,6 +197,41 @@ def test_a_cluster_with_tls_takes_its_own_certificates_only(tmp_path, pairs, exp
         with configured(ours), DaskCluster(cluster.address) as workers:
             assert len(workers.executors()) == 1
             assert written(VerificationPool(workers.executors)(pairs, CONFIG)) == expected
+
+
+def is_silent(port):
+    """Whether a port of another machine's processes, asked without a certificate, says nothing but 404."""
+    address = "127.0.0.1" if port.ip in ("0.0.0.0", "::") else port.ip
+    with socket.create_connection((address, port.port), 5.0) as plain:
+        plain.sendall(b"GET /metrics HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+        with suppress(ConnectionError):
+            answer = plain.recv(1000)
+            return answer.startswith(b"HTTP/1.1 404") if port.ip == "127.0.0.1" else not answer.startswith(b"HTTP")
+    return True
+
+
+def test_the_documented_cluster_answers_nobody_without_its_certificates(tmp_path, monkeypatch):
+    """Lists the open ports of both commands: other machines reach those with TLS only, and the others have no pages."""
+    import psutil
+
+    credentials(tmp_path)
+    monkeypatch.chdir(tmp_path / "cluster")
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "cluster.md").read_text(encoding="utf-8")
+    for name, value in re.findall(r"^    export (\w+ROUTES)='(.*)'$", page, re.MULTILINE):
+        monkeypatch.setenv(name, value)
+    documented = [re.search(rf"^    dask {kind} (.*)$", page, re.MULTILINE)[1] for kind in ("scheduler", "worker")]
+    with Cluster(tmp_path, "tls", start=False) as cluster:
+        scheduler, worker = (options.split() for options in documented)
+        scheduler[scheduler.index("tls://:8786")], worker[worker.index("4")] = "tls://:0", "1"
+        cluster.start("scheduler", *scheduler, "--scheduler-file", "s.json")
+        worker[worker.index("tls://scheduler:8786")] = wait_for(lambda: written_address(Path("s.json")))
+        cluster.start("worker", *worker)
+        wait_for(lambda: "Registered to" in (tmp_path / "worker-1.log").read_text())
+        programs = [psutil.Process(each.pid) for each in cluster.processes]
+        programs += [child for each in programs for child in each.children(recursive=True)]
+        ports = {one.laddr for each in programs for one in each.net_connections("tcp") if one.status == "LISTEN"}
+        assert len(ports) >= 5  # scheduler, worker and nanny, and HTTP of the first two
+        assert [port for port in ports if not is_silent(port)] == []
 
 
 def test_the_command_maps_the_same_on_a_cluster_and_on_processes(tmp_path, logs, capsys):

@@ -32,13 +32,14 @@ exec setpriv --no-new-privs --bounding-set=-all --inh-caps=-all -- "$@"
 capabilities, because the Python of this machine may lie where only root can read it."""
 
 
-def unit():
-    """The first unit of the page, by section and key."""
-    page = (ROOT / "docs" / "howto" / "deploy.md").read_text(encoding="utf-8")
-    parser = configparser.ConfigParser()
-    parser.optionxform = str
-    parser.read_string(re.search(r"```ini\n(\[Unit\]\n.*?)```", page, re.DOTALL)[1])
-    return parser
+def units():
+    """The units of the page, by section and key: that of the service and that of a robot."""
+    page, found = (ROOT / "docs" / "howto" / "deploy.md").read_text(encoding="utf-8"), []
+    for text in re.findall(r"```ini\n(\[Unit\]\n.*?)```", page, re.DOTALL):
+        found.append(configparser.ConfigParser())
+        found[-1].optionxform = str
+        found[-1].read_string(text)
+    return found
 
 
 def may_restrict():
@@ -56,21 +57,26 @@ def lay_code(cache):
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
-def test_systemd_understands_the_unit(tmp_path):
-    path = tmp_path / "fcslam-cloud.service"
-    parser = unit()
+@pytest.mark.parametrize("parser", units(), ids=["cloud", "robot"])
+def test_systemd_understands_the_unit_and_calls_it_safe(parser, tmp_path):
+    path = tmp_path / "fcslam.service"
     parser["Service"]["ExecStart"] = re.sub(r"^\S+", "/bin/true", parser["Service"]["ExecStart"])
     parser["Service"]["User"] = "daemon"
     with path.open("w") as file:
         parser.write(file, space_around_delimiters=False)
     said = subprocess.run(["systemd-analyze", "verify", path], capture_output=True, text=True, check=False)
     assert [line for line in said.stderr.splitlines() if path.name in line] == []
+    parser["Service"]["User"] = "fcslam"
+    with path.open("w") as file:
+        parser.write(file, space_around_delimiters=False)
+    rated = ["systemd-analyze", "security", "--offline=true", "--threshold=20", path]  # 2.0 of 10
+    subprocess.run(rated, capture_output=True, check=True)
 
 
 @pytest.mark.system
 @pytest.mark.skipif(not may_restrict(), reason="needs root, unshare and setpriv, to make the file system read-only")
 def test_the_service_of_the_unit_runs_under_its_restrictions(tmp_path):
-    service = unit()["Service"]
+    service = units()[0]["Service"]
     assert (service["ProtectSystem"], service["NoNewPrivileges"]) == ("strict", "yes")
     state, cache, etc = (tmp_path / name for name in ("state", "cache", "etc"))
     state.mkdir()
