@@ -104,7 +104,8 @@ class ClosureDecisions(Kept):
 
     def counts(self) -> dict[str, int]:
         """Accepted closures so far, by kind."""
-        accepted = [entry.is_between for entry in self.closures if entry.closure.status is ClosureStatus.ACCEPTED]
+        closures = (entry.closure for entry in self.closures)
+        accepted = [c.i.robot != c.j.robot for c in closures if c.status is ClosureStatus.ACCEPTED]
         return {"within robots": accepted.count(False), "between robots": accepted.count(True)}
 
     def add_local(self, closure: Constraint, tag: Tag | None = None) -> None:

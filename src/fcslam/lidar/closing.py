@@ -60,7 +60,7 @@ LEAST_GAP_M = 1.5 * SIGHT_M
 MOST_CANDIDATES = 4
 """Largest number of earlier visits that a submap is compared with; in a square with more than ``MOST_NEARBY``, one
 closure ties it to the well-known area."""
-UNPACKED = 4 * MOST_CANDIDATES
+UNPACKED = 16 * MOST_CANDIDATES
 """Submaps that are kept ready for comparison, 0.2 MB each."""
 SIMILAR_PLACES = 6 * MOST_CANDIDATES
 """Most similar earlier submaps among which the places to compare are chosen."""

@@ -117,13 +117,17 @@ def contradicted_facing(scans: Iterable[LaserScan]) -> Contradiction | None:
 
     If it faces as stated in the result, the scans fit the odometry in no certain way.
     """
-    trial = _Trial(*_pairs(islice(scans, MOST_COMPARED)))
+    moves, turns = _pairs(islice(scans, MOST_COMPARED))
+    trial = _Trial(moves, turns)
     as_stated = trial.agreements(AS_STATED)
     stated = trial.mean(as_stated)
     if len(trial.pairs) < FEWEST_PAIRS or stated > ENOUGH_AGREEMENT:
         return None
     coarse, fine = STEPS_DEG
     facings = [Facing(turned, flipped) for flipped in (False, True) for turned in range(0, 360, coarse)]
+    some = _Trial(moves[::FEWEST_PAIRS], turns[::FEWEST_PAIRS])
+    if stated > NO_AGREEMENT and max(facings, key=lambda facing: some.mean(some.agreements(facing))) == AS_STATED:
+        return None  # a fifth of the pairs tells that no other mounting is right
     scores = {facing: trial.agreements(facing) for facing in facings}
     best = max(scores, key=lambda facing: trial.mean(scores[facing]))
     near = (best._replace(turned_deg=best.turned_deg + step) for step in range(-coarse // 2, coarse // 2 + 1, fine))

@@ -65,8 +65,10 @@ class Cabin:
 def _seen_area_m2(scan: LaserScan) -> float:
     """Area between the laser and the returns; infinity if it is open to some side, or not all sides are seen."""
     ranges_m, step_rad = scan.matched_ranges_m, abs(scan.laser.angle_increment_rad)
+    if step_rad * scan.laser.beam_count < LEAST_SPAN_RAD:
+        return math.inf
     valid = ranges_m > 0.0
-    if step_rad * int(valid.sum()) < LEAST_SPAN_RAD:
+    if step_rad * np.count_nonzero(valid) < LEAST_SPAN_RAD:
         return math.inf
     seen_m = np.where(valid & (ranges_m < scan.laser.max_range_m), ranges_m, np.where(valid, np.inf, 0.0))
     seen_m[2:-2] = np.minimum(seen_m[2:-2], np.maximum(seen_m[:-4], seen_m[4:]))  # some beams get lost

@@ -17,7 +17,6 @@ from typing import Any, Final, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from fcslam.geometry import se2
 from fcslam.graph.cholesky import find_structure, marginal_covariance
@@ -107,9 +106,7 @@ def certify(
     absolute, relative = places.absolute_m(), places.relative_m(within_m)
     local = places.relative_m(SEEN_FROM_M)
     centres = _known_squares(occupancy)
-    nearest = np.zeros(0, np.int64)
-    if len(centres):
-        nearest = np.asarray(cKDTree(places.poses[:, :2]).query(centres)[1], np.int64)
+    nearest = np.array([np.argmin(_distances(places.poses, centre)) for centre in centres], np.int64)
     turn = np.sqrt(np.diag(places.covariance)[2::3])
     lever = np.hypot(*(centres - places.poses[nearest, :2]).T) * turn[nearest]
     passes, seen_s = _passes(centres, paths)
@@ -178,12 +175,12 @@ def relative_error(
     """
     result = np.full(len(poses), FLOOR_M)
     blocks = covariance.reshape(len(poses), 3, len(poses), 3).transpose(0, 2, 1, 3)
-    tree = cKDTree(poses[:, :2])
     for k in range(len(poses)) if wanted is None else wanted:
-        others = np.array(tree.query_ball_point(poses[k, :2], within_m), np.int64)
-        near = np.sort(others[others != k])
+        away_m = _distances(poses, poses[k])
+        away_m[k] = math.inf
+        near = np.flatnonzero(away_m <= within_m)
         if not len(near) and len(poses) > 1:
-            near = np.asarray(tree.query(poses[k, :2], [2])[1])
+            near = np.argsort(away_m)[:1]
         if len(near):
             apart = poses[near, :2] - poses[k, :2]
             swing = apart @ _S.T  # change of the other's position by a turn of this place
@@ -268,16 +265,18 @@ def _known_squares(occupancy: OccupancyMap) -> FloatArray:
 def _passes(centres: FloatArray, paths: Sequence[MappedPath]) -> tuple[NDArray[np.int64], FloatArray]:
     """How often robots passed each square, and the stamp of the last keyscan near it; NaN if none was."""
     count, newest = np.zeros(len(centres), np.int64), np.full(len(centres), np.nan)
-    if not len(centres):
-        return count, newest
     for path in paths:
-        tree = cKDTree(path.T_map_base[:, :2])
-        for k, near in enumerate(tree.query_ball_point(centres, SEEN_FROM_M)):
-            if near:
-                stamps = np.sort(path.stamps[near])
+        for k, centre in enumerate(centres):
+            stamps = np.sort(path.stamps[_distances(path.T_map_base, centre) <= SEEN_FROM_M])
+            if len(stamps):
                 count[k] += 1 + int((np.diff(stamps) > PASS_GAP_S).sum())
                 newest[k] = np.nanmax((newest[k], stamps[-1]))
     return count, newest
+
+
+def _distances(poses: FloatArray, place: FloatArray) -> FloatArray:
+    """Distance of each pose (N, 3) from a place, shape (2,) or (3,), metres, shape (N,)."""
+    return np.asarray(np.hypot(poses[:, 0] - place[0], poses[:, 1] - place[1]))
 
 
 def _open_stretches(graph: PoseGraph, paths: Sequence[MappedPath]) -> list[dict[str, Any]]:

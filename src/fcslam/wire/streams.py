@@ -20,6 +20,7 @@ KeypointCodes = NDArray[np.int16]
 _RAW: Final = -15
 """Window of zlib's raw format, without a header and a checksum."""
 _BITS: Final = 8 * CODE_BYTES
+_EARLIER: Final = np.tri(_BITS, k=-1, dtype=np.int16)
 
 
 def pack_ranges(codes: RangeCodes) -> bytes:
@@ -64,12 +65,12 @@ def pack_descriptors(descriptors: Codes) -> bytes:
     """
     bits = np.ascontiguousarray(np.unpackbits(descriptors, axis=1).T)
     words = np.packbits(np.pad(bits, ((0, 0), (0, -len(descriptors) % 64))), axis=1).view(np.uint64)
-    likeness = np.full((_BITS, _BITS), len(descriptors), np.int32)
+    different = np.zeros((_BITS, _BITS), np.int16)
     for word in words.T:  # no product of matrices: the threads of BLAS take ten times as long as one
-        likeness -= 2 * np.bitwise_count(word[:, None] ^ word).astype(np.int32)
-    likeness = np.tril(likeness, -1)
-    like = np.abs(likeness).argmax(axis=1)
-    opposite = np.take_along_axis(likeness, like[:, None], axis=1) < 0
+        different += np.bitwise_count(word[:, None] ^ word)
+    likeness = len(descriptors) - 2 * different
+    like = (np.abs(likeness) * _EARLIER).argmax(axis=1)
+    opposite = (likeness[np.arange(_BITS), like] < 0)[:, None]
     bits[1:] ^= bits[like[1:]] ^ opposite[1:]
     head = like.astype(np.uint8).tobytes() + np.packbits(opposite).tobytes()
     return min(descriptors.tobytes(), _deflate(head + np.packbits(bits, axis=1).tobytes()), key=len)
