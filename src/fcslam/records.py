@@ -1,7 +1,8 @@
 """Frozen records that packages exchange. Their arrays are read-only.
 
-Poses are (x, y, theta) in metres and radians; ``T_a_b`` takes coordinates in b to a. Coordinate frames as in ROS
-REP 105: ``map``, ``odom``, ``base``, ``laser``. Stamps are seconds of the recording's own clock.
+Poses are (x, y, theta) in metres and radians, or (x, y, z, qx, qy, qz, qw) in space; ``T_a_b`` takes coordinates in b
+to a. Coordinate frames as in ROS REP 105: ``map``, ``odom``, ``base``, ``laser``. Stamps are seconds of the recording's
+own clock.
 """
 
 import math
@@ -307,9 +308,9 @@ class Constraint:
     j: int
     kind: ConstraintKind
     T_i_j: FloatArray
-    """Pose of keyscan j's base in keyscan i's base, shape (3,)."""
+    """Pose of keyscan j's base in keyscan i's base: in the plane, shape (3,), or in space, shape (7,)."""
     information: FloatArray
-    """Inverse covariance of T_i_j in the tangent space at T_i_j (x, y, theta of base j), shape (3, 3)."""
+    """Inverse covariance of T_i_j in the tangent space at T_i_j (coordinates of base j), shape (3, 3) or (6, 6)."""
 
 
 class Channel(StrEnum):
@@ -399,6 +400,41 @@ class DetectorFile:
     """Size of the file in bytes."""
     sha256: bytes
     """SHA-256 of the file, 32 bytes."""
+
+
+Steps = NDArray[np.int16]
+"""Coordinates (N, 3) in steps of ``STEP_M``."""
+STEP_M = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VoxelMap:
+    """The surfaces around a keyscan in space, in the frame ``ground``.
+
+    ``ground`` is level; its origin is on the floor below the keyscan's base. Its x axis has the heading of the base.
+    """
+
+    id: KeyscanId
+    first: int
+    """Number of the first keyscan of its scans."""
+    last: int
+    """Number of the last one (inclusive)."""
+    T_base_ground: FloatArray
+    """Shape (7,)."""
+    points: Steps
+    """In ``ground``, shape (N, 3): one point in each voxel with returns, by ``geometry.voxels.voxelised``."""
+    origins: Steps
+    """Where the scanner was, in ``ground``, shape (M, 3)."""
+
+    @property
+    def points_m(self) -> FloatArray:
+        """The points in metres, shape (N, 3)."""
+        return STEP_M * self.points.astype(np.float64)
+
+    @property
+    def origins_m(self) -> FloatArray:
+        """The positions of the scanner in metres, shape (M, 3)."""
+        return STEP_M * self.origins.astype(np.float64)
 
 
 class ClosureStatus(StrEnum):
@@ -642,7 +678,8 @@ class Correction:
     map_index: int
     """Identifies one of the maps that are not joined yet; it may change when maps join."""
     T_map_odom: FloatArray
-    """Shape (3,). Here, ``odom`` is the chain of the robot's motions between keyscans; its first keyscan is zero."""
+    """Shape (3,), or (7,) in space. Here, ``odom`` is the chain of the robot's motions between keyscans; its first
+    keyscan is zero."""
     quality: float = 0.0
     """Support by other sessions, in [0, 1]; 0 if no other session supports the pose. It is the agreement of the newest
     comparison with places of other sessions, times 1 - 2^-n with n places that closures connect to others. Both count

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2
 from fcslam.graph.cluster import count_separate_places, dominant_cluster, maximum_clique, relative_frame
 from fcslam.graph.consistency import (
     Closures,
@@ -14,7 +15,6 @@ from fcslam.graph.consistency import (
     pairwise_consistency,
 )
 from fcslam.graph.evidence import ConsistencySettings, MapFit
-from fcslam.graph.pose_graph import CHI2_LIMIT
 from fcslam.graph.trajectory import DRIFT, Trajectory, build_trajectory
 from fcslam.records import Reason, ReasonCode
 from tests.graph.graph_worlds import INFORMATION, manhattan, measured, walk
@@ -27,7 +27,9 @@ ROBOT_DRIFT = np.array([0.03, 0.03, 0.01])
 def path_of(poses: np.ndarray, own: np.ndarray | float = 0.0) -> Trajectory:
     """The trajectory of a robot that drifts by ``ROBOT_DRIFT``, and by ``own`` at each step, shape (N - 1, 3, 3)."""
     metres = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-    return build_trajectory(poses, metres[:, None, None] * np.diag(ROBOT_DRIFT**2 - np.square(DRIFT)) + own)
+    return build_trajectory(
+        poses, metres[:, None, None] * np.diag(ROBOT_DRIFT**2 - np.square(SE2.sigmas(*DRIFT))) + own
+    )
 
 
 STILL = path_of(np.zeros((1, 3)))
@@ -229,7 +231,7 @@ def test_a_keyscan_out_of_range_is_refused() -> None:
 def test_every_pair_is_tested() -> None:
     a, b, closures = two_robots(0)
     whole = pairwise_consistency(a, b, closures)
-    assert np.array_equal(whole, pairwise_chi2(a, b, closures) <= CHI2_LIMIT)
+    assert np.array_equal(whole, pairwise_chi2(a, b, closures) <= SE2.chi2_limit)
     none = closures.select(np.zeros(0, dtype=np.int64))
     assert pairwise_consistency(a, b, none).shape == (0, 0)
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2
 from fcslam.graph.cholesky import find_structure, solve
 from fcslam.graph.least_squares import Loss
-from fcslam.graph.pose_graph import SE2
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 6])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2
 from fcslam.graph.initialization import initialize, initialize_robust
 from fcslam.graph.least_squares import Loss, minimize
 from fcslam.graph.optimizer import (
@@ -16,7 +17,7 @@ from fcslam.graph.optimizer import (
     optimize_gnc,
     refine_inliers,
 )
-from fcslam.graph.pose_graph import SE2, Edge, PoseGraph
+from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.single_robot import solve_single_robot
 from tests.graph.graph_worlds import INFORMATION, gtsam_optimum, manhattan
 

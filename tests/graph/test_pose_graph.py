@@ -7,7 +7,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import gammaincinv
 
 from fcslam.geometry import se2
-from fcslam.graph.pose_graph import CHI2_LIMIT, MAXIMUM_INFORMATION, PROBABILITY, Edge, PoseGraph
+from fcslam.geometry.groups import SE2, SE3
+from fcslam.graph.pose_graph import MAXIMUM_INFORMATION, Edge, PoseGraph
 from tests.graph.graph_worlds import INFORMATION, manhattan
 
 
@@ -106,4 +107,5 @@ def test_components_are_those_of_scipy() -> None:
 
 
 def test_limit_of_chi_square_is_its_quantile() -> None:
-    assert pytest.approx(float(2.0 * gammaincinv(1.5, PROBABILITY)), rel=1e-12) == CHI2_LIMIT
+    for group in (SE2, SE3):
+        assert pytest.approx(float(2.0 * gammaincinv(group.freedom / 2.0, 0.99)), rel=1e-12) == group.chi2_limit

@@ -22,6 +22,7 @@ from fcslam.records import (
     Tag,
     TagFamily,
     TagSighting,
+    VoxelMap,
     frozen,
 )
 from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
@@ -83,6 +84,23 @@ TAG_SIGHTING = TagSighting(
     frozen([[400.0, 16.0, -8.0], [16.0, 900.0, 4.0], [-8.0, 4.0, 100.0]]),
 )
 KEYSCAN_FIX = KeyscanFix(KeyscanId("alice", 12), 47.3769, 8.5417, 408.0, 1.5, (-0.25, 0.5))
+SPACE_ODOMETRY = Constraint(
+    "alice",
+    11,
+    12,
+    ConstraintKind.ODOMETRY,
+    frozen([0.5, -0.03125, 0.125, 0.5, -0.5, 0.5, 0.5]),
+    frozen(np.diag([2500.0, 1600.0, 900.0, 1e4, 1e4, 1e4]) + np.outer(*2 * (np.arange(6.0),))),
+)
+VOXEL_MAP = VoxelMap(
+    KeyscanId("alice", 12),
+    2,
+    12,
+    frozen([0.0, 0.0, -0.125, 0.5, 0.5, -0.5, 0.5]),
+    frozen([[-640, -640, -320], [-3, 4, 5], [-1, 4, 10], [0, 0, 0], [639, 639, 959]], np.int16),
+    frozen([[0, 0, 30], [-25, 3, 31]], np.int16),
+)
+SPACE_CORRECTION = Correction("alice", 5, 0, frozen([10.5, -20.25, 3.125, 0.5, 0.5, -0.5, 0.5]), 0.5)
 CORRECTION = Correction("alice", 4, 0, frozen([10.5, -20.25, 3.125]), 0.75)
 ACKNOWLEDGEMENT = Acknowledgement("alice", 7, 41)
 DETECTOR_UPDATE = DetectorUpdate(
@@ -106,6 +124,9 @@ EXAMPLES = {
     "camera_place": packet(CAMERA_PLACE),
     "tag_sighting": packet(TAG_SIGHTING),
     "keyscan_fix": packet(KEYSCAN_FIX),
+    "space_odometry": packet(SPACE_ODOMETRY),
+    "voxel_map": packet(VOXEL_MAP),
+    "space_correction": packet(SPACE_CORRECTION),
     "correction": packet(CORRECTION),
     "acknowledgement": packet(ACKNOWLEDGEMENT),
     "detector_update": packet(DETECTOR_UPDATE),

@@ -4,6 +4,8 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from fcslam.geometry import se3
+from fcslam.geometry.voxels import voxelised
 from fcslam.records import (
     PLACE_CHANNELS,
     Constraint,
@@ -19,6 +21,7 @@ from fcslam.records import (
     Tag,
     TagFamily,
     TagSighting,
+    VoxelMap,
 )
 from fcslam.wire.limits import KEYPOINT_AXES
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
@@ -50,12 +53,17 @@ def lasers():
     )
 
 
+def space_poses():
+    tangent = st.tuples(*3 * (COORDINATES,), *3 * (st.floats(-1.8, 1.8),))
+    return tangent.map(lambda v: np.append(v[:3], se3.exp((0.0, 0.0, 0.0, *v[3:]))[3:]))
+
+
 @st.composite
-def informations(draw):
+def informations(draw, freedom=3):
     """Correlations bounded away from singular, standard deviations from 0.1 mm to 100 m."""
-    factor = draw(hnp.arrays(np.float64, (3, 3), elements=st.floats(-1.0, 1.0)))
-    deviation = 10.0 ** np.array(draw(st.tuples(*[st.floats(-4.0, 2.0)] * 3)))
-    matrix = (factor @ factor.T + 0.01 * np.eye(3)) / deviation / deviation[:, np.newaxis]
+    factor = draw(hnp.arrays(np.float64, (freedom, freedom), elements=st.floats(-1.0, 1.0)))
+    deviation = 10.0 ** np.array(draw(st.tuples(*[st.floats(-4.0, 2.0)] * freedom)))
+    matrix = (factor @ factor.T + 0.01 * np.eye(freedom)) / deviation / deviation[:, np.newaxis]
     return (matrix + matrix.T) / 2.0
 
 
@@ -93,7 +101,18 @@ def places(draw, robot):
 def constraints(draw, robot):
     j = draw(st.integers(1, 2**31 - 1))
     i = draw(st.integers(0, j - 1))
-    return Constraint(robot, i, j, draw(st.sampled_from(ConstraintKind)), draw(poses()), draw(informations()))
+    pose, freedom = draw(st.sampled_from([(poses(), 3), (space_poses(), 6)]))
+    return Constraint(robot, i, j, draw(st.sampled_from(ConstraintKind)), draw(pose), draw(informations(freedom)))
+
+
+@st.composite
+def voxel_maps(draw, robot):
+    first = draw(NUMBERS)
+    last = draw(st.integers(first, 2**31 - 1))
+    number = draw(st.integers(first, last))
+    positions = hnp.arrays(np.float64, st.tuples(st.integers(1, 30), st.just(3)), elements=st.floats(-6.4, 12.7))
+    points, origins = voxelised(draw(positions)), voxelised(draw(positions))
+    return VoxelMap(KeyscanId(robot, number), first, last, draw(space_poses()), points, origins)
 
 
 def tags():
@@ -152,9 +171,10 @@ def bodies(robot, epoch, time):
         keyscans(identity, stamps),
         constraints(robot),
         places(robot),
+        voxel_maps(robot),
         st.builds(TagSighting, identity, tags(), poses(), informations()),
         keyscan_fixes(identity),
-        st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses(), st.floats(0.0, 1.0, width=32)),
+        st.builds(Correction, st.just(robot), NUMBERS, NUMBERS, poses() | space_poses(), st.floats(0.0, 1.0, width=32)),
         st.builds(Acknowledgement, st.just(robot), EPOCHS, SEQUENCES),
         st.builds(DetectorUpdate, st.just(robot), detector_files()),
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 from fcslam.wire import fcslam_pb2 as pb
 
 PAGE = Path(__file__).parents[2] / "docs" / "concepts" / "what-leaves.md"
-PLAIN = {"Pose"}
+PLAIN = {"Pose", "SpacePose"}
 """Messages without a meaning of their own besides the field that holds them."""
 
 

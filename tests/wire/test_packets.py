@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given, settings
 
 from fcslam.errors import PacketError
-from fcslam.records import Constraint, Keyscan, Place, TagSighting
+from fcslam.geometry.voxels import voxelised
+from fcslam.records import Constraint, Keyscan, Place, TagSighting, VoxelMap
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.limits import VERSION
 from fcslam.wire.messages import Packet, PacketKind
 from fcslam.wire.packets import Label, decode, encode, read_label, unpacked_size
-from tests.wire.examples import EXAMPLES, GOLDEN, LIDAR_PLACE, ODOMETRY, packet, same
+from tests.wire.examples import EXAMPLES, GOLDEN, LIDAR_PLACE, ODOMETRY, VOXEL_MAP, packet, same
 from tests.wire.strategies import informations, packets
 
 pytestmark = pytest.mark.slow
@@ -49,6 +50,7 @@ def test_a_packet_counts_for_what_it_unpacks_to(sent):
     plain = 2 * len(body.ranges_m) if isinstance(body, Keyscan) else 0
     if isinstance(body, Place):
         plain = 2 * body.keypoints.size + body.descriptors.size
+    plain += 4 * len(body.points) if isinstance(body, VoxelMap) else 0
     assert len(data) + plain <= unpacked_size(data) <= len(data) + 1.4 * plain
     assert unpacked_size(data + b"!") == len(data) + 1
 
@@ -109,10 +111,15 @@ def test_read_label_reads_no_body():
 
 
 def test_the_largest_packets_fit():
-    """A place with the most keypoints and a keyscan with the most, and the wildest, ranges."""
+    """A place with the most keypoints, a keyscan with the most ranges and a voxel map as dense as they get."""
     keypoints = np.full((2048, 2), 327.67, np.float32)
     place = replace(LIDAR_PLACE, keypoints=keypoints, descriptors=np.full((2048, 32), 255, np.uint8))
     assert same(decode(encode(packet(place))).body, place)
     ranges = np.resize(np.array([0.0, 131.068, np.inf], np.float32), 4096)
     keyscan = Keyscan(LIDAR_PLACE.id, 0.0, ranges)
     assert same(decode(encode(packet(keyscan))).body, keyscan)
+    walls = np.random.default_rng(0).uniform((-8.0, -8.0, 0.0), (8.0, 8.0, 3.0), (100_000, 3))
+    walls[:, 0] = np.round(walls[:, 0] / 2.0) * 2.0
+    local = replace(VOXEL_MAP, points=voxelised(walls))
+    assert len(local.points) > 30_000
+    assert same(decode(encode(packet(local))).body, local)

@@ -10,6 +10,7 @@ import pytest
 from google.protobuf.descriptor import FieldDescriptor
 
 from fcslam.errors import PacketError
+from fcslam.geometry.voxels import MOST_POINTS
 from fcslam.records import PLACE_CHANNELS, ConstraintKind
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire import limits
@@ -40,8 +41,10 @@ LONGEST = {
     "Hello.lasers": 8,
     "Hello.detectors": 2,
     "Hello.floor": 16,
-    "Constraint.information": 6,
+    "Constraint.information": 21,
     "Keyscan.sweep": 8,
+    "VoxelMap.points": 4 * 32768,
+    "VoxelMap.origins": 3 * 256,
     "TagSighting.family": 16,
     "TagSighting.information": 6,
 }
@@ -50,6 +53,7 @@ LONGEST = {
 
 ELEMENTS = {
     "Keyscan.sweep": [1],
+    "VoxelMap.origins": [1],
     "Hello.detectors": [pb.Detector(channel=1, version="a")],
     "Hello.lasers": list(pb.Packet.FromString(encode(EXAMPLES["hello"])).hello.lasers[:1]),
 }
@@ -156,5 +160,6 @@ def test_the_documents_name_every_field_and_limit():
         limits.MAXIMUM_BEAMS,
         limits.MAXIMUM_KEYPOINTS,
         limits.MAXIMUM_NETWORK_BYTES,
+        MOST_POINTS,
     ):
         assert str(number) in plain

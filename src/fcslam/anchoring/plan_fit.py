@@ -11,8 +11,9 @@ from fcslam.anchoring.part import ROUNDS, MapPart
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.cloud.result import MappedRobot
 from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2
 from fcslam.graph.optimizer import PosePrior, optimize_anchored
-from fcslam.graph.pose_graph import CHI2_LIMIT, PoseGraph
+from fcslam.graph.pose_graph import PoseGraph
 from fcslam.lidar import matching
 from fcslam.lidar.field import CELL_M
 from fcslam.lidar.matching import match_scan
@@ -67,7 +68,7 @@ def fit_to_plan(plan: BuildingPlan, part: MapPart, T_plan_map: FloatArray) -> tu
     for number in range(ROUNDS):
         priors = _priors(plan, scans, poses, wide_scale_m=0.4 if number == 0 else 0.2)
         if number:
-            priors = [prior for prior in priors if prior.chi2(poses) < CHI2_LIMIT]
+            priors = [prior for prior in priors if prior.chi2(poses) < SE2.chi2_limit]
         if not priors:
             break
         poses = optimize_anchored(fitted.graph, poses, priors)

@@ -16,6 +16,7 @@ from fcslam.records import (
     KeyscanId,
     Place,
     TagSighting,
+    VoxelMap,
 )
 from fcslam.wire.checks import check_name
 from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Hello, Packet
@@ -58,7 +59,7 @@ def in_session(packet: Packet) -> Packet:
 
 def _renamed(body: Body, session: str) -> Body:
     match body:
-        case Keyscan() | Place() | TagSighting() | KeyscanFix():
+        case Keyscan() | Place() | TagSighting() | KeyscanFix() | VoxelMap():
             return replace(body, id=KeyscanId(session, body.id.number))
         case Hello() | Constraint() | Correction() | Acknowledgement() | DetectorUpdate():
             return replace(body, robot=session)

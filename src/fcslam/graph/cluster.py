@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fcslam.geometry import se2
 from fcslam.geometry.alignment import two_point_alignment
+from fcslam.geometry.groups import SE2, group_of
 from fcslam.graph.consistency import Closures, pairwise_consistency
 from fcslam.graph.evidence import LEAD, ClusterEvidence, ConsistencySettings, MapFit, refutation, shortfall
 from fcslam.graph.trajectory import Trajectory
@@ -101,28 +101,32 @@ def closure_positions(a: Trajectory, b: Trajectory, closures: Closures) -> Float
 
 
 def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
-    """Estimate ``T_a_b`` (3,) of the frames of two trajectories from the two matched places that lie farthest apart.
+    """Estimate ``T_a_b`` (P,) of the frames of two trajectories from the two matched places that lie farthest apart.
 
-    Implements eqs. (5)-(6) of FC-SLAM. If these places are too close to each other in a or b to fix a rotation, the
-    first closure alone gives the transform. Tags fix the heading worse than walls, so closures by tags count only
-    without others, and then all of them by their information.
+    Implements eqs. (5)-(6) of FC-SLAM in the plane. If these places are too close to each other in a or b to fix a
+    rotation, the first closure alone gives the transform. Tags fix the heading worse than walls, so closures by tags
+    count only without others, and then all of them by their information. In space, two points fix no rotation, so all
+    closures count.
     """
+    group = group_of(closures.T_i_j)
+    if group is not SE2:
+        return _mean_frame(a, b, closures)
     if (closures.tags > 0).any():
         walls = np.flatnonzero(closures.tags == 0)
         if not len(walls):
             return _mean_frame(a, b, closures)
         closures = closures.select(walls)
-    T_a_j = se2.compose(a.poses[closures.i], closures.T_i_j)
+    T_a_j = group.compose(a.poses[closures.i], closures.T_i_j)
     in_a, in_b = T_a_j[:, :2], b.poses[closures.j, :2]
     distance = np.hypot(*np.moveaxis(in_b[:, None] - in_b[None], -1, 0))
     k, m = np.unravel_index(int(np.argmax(distance)), distance.shape)
     if min(distance[k, m], np.hypot(*(in_a[k] - in_a[m]))) < DIRECTION_M:
-        return se2.compose(T_a_j[0], se2.inverse(b.poses[closures.j[0]]))
+        return group.compose(T_a_j[0], group.inverse(b.poses[closures.j[0]]))
     return two_point_alignment(in_a[[k, m]], in_b[[k, m]])
 
 
 def local_frames(a: Trajectory, b: Trajectory, members: Closures) -> FloatArray:
-    """T_a_b (N, 3) at each of the N keyscans of b by the closure that is nearest along b's path, without drift.
+    """T_a_b (N, P) at each of the N keyscans of b by the closure that is nearest along b's path, without drift.
 
     NaN farther than ``FARTHEST_M`` of path from any closure. Tags fix the heading worse than walls, so they count only
     without other closures, and then all together.
@@ -130,26 +134,27 @@ def local_frames(a: Trajectory, b: Trajectory, members: Closures) -> FloatArray:
     walls = np.flatnonzero(members.tags == 0) if len(members.tags) else np.arange(len(members))
     if not len(walls):
         return np.broadcast_to(relative_frame(a, b, members), b.poses.shape)
-    members = members.select(walls)
+    members, group = members.select(walls), group_of(b.poses)
     distance_m = np.abs(b.travel_m[:, None] - b.travel_m[members.j][None])
     nearest = np.argmin(distance_m, axis=1)
-    T_a_b = se2.compose(se2.compose(a.poses[members.i], members.T_i_j), se2.inverse(b.poses[members.j]))
+    T_a_b = group.compose(group.compose(a.poses[members.i], members.T_i_j), group.inverse(b.poses[members.j]))
     T: FloatArray = T_a_b[nearest]
     T[distance_m.min(axis=1) > FARTHEST_M] = np.nan
     return T
 
 
 def _mean_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArray:
-    """``T_a_b`` (3,) by least squares over all closures, from the most precise one."""
-    T_i_a, T_b_j = se2.inverse(a.poses[closures.i]), b.poses[closures.j]
+    """``T_a_b`` (P,) by least squares over all closures, from the most precise one."""
+    group = group_of(closures.T_i_j)
+    T_i_a, T_b_j = group.inverse(a.poses[closures.i]), b.poses[closures.j]
     best = int(np.argmax(np.linalg.det(closures.information)))
-    T_a_b = se2.compose(se2.inverse(T_i_a[best]), se2.compose(closures.T_i_j[best], se2.inverse(T_b_j[best])))
-    moved = se2.adjoint(se2.inverse(T_b_j))
+    T_a_b = group.compose(group.inverse(T_i_a[best]), group.compose(closures.T_i_j[best], group.inverse(T_b_j[best])))
+    moved = group.adjoint(group.inverse(T_b_j))
     weighted = moved.swapaxes(-1, -2) @ closures.information
     for _ in range(_MEAN_ROUNDS):
-        residuals = se2.log(se2.between(closures.T_i_j, se2.compose(se2.compose(T_i_a, T_a_b), T_b_j)))
+        residuals = group.log(group.between(closures.T_i_j, group.compose(group.compose(T_i_a, T_a_b), T_b_j)))
         step = np.linalg.solve((weighted @ moved).sum(axis=0), -np.einsum("kab,kb->a", weighted, residuals))
-        T_a_b = se2.compose(T_a_b, se2.exp(step))
+        T_a_b = group.retract(T_a_b, step)
     return T_a_b
 
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.geometry import se2
-from fcslam.graph.pose_graph import CHI2_LIMIT
+from fcslam.geometry.groups import group_of
 from fcslam.graph.trajectory import Trajectory, transport_covariance
 from fcslam.records import FloatArray
 
@@ -33,9 +32,9 @@ class Closures:
     j: NDArray[np.int64]
     """Keyscan of b, shape (K,)."""
     T_i_j: FloatArray
-    """Pose of keyscan j in keyscan i, shape (K, 3), metres and radians."""
+    """Pose of keyscan j in keyscan i, shape (K, P)."""
     information: FloatArray
-    """Information of T_i_j in the tangent space at T_i_j, shape (K, 3, 3)."""
+    """Information of T_i_j in the tangent space at T_i_j, shape (K, d, d)."""
     tags: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     """Number from 1 of the tag that both keyscans saw, 0 without one, shape (K,); empty: no closure has one."""
 
@@ -45,12 +44,20 @@ class Closures:
     def reversed(self, rows: NDArray[np.bool_]) -> "Closures":
         """The same closures; those where ``rows``, shape (K,), is true lead from j to i."""
         # The tangent space moves from j to i: v_i = -Ad(T_i_j) v_j.
-        back = np.linalg.inv(se2.adjoint(self.T_i_j[rows]))
+        group = group_of(self.T_i_j)
+        back = np.linalg.inv(group.adjoint(self.T_i_j[rows]))
         i, j = np.where(rows, self.j, self.i), np.where(rows, self.i, self.j)
         T_i_j, information = self.T_i_j.copy(), self.information.copy()
-        T_i_j[rows] = se2.inverse(self.T_i_j[rows])
+        T_i_j[rows] = group.inverse(self.T_i_j[rows])
         information[rows] = back.swapaxes(-1, -2) @ self.information[rows] @ back
         return Closures(i, j, T_i_j, information, self.tags)
+
+    def to_plane(self) -> "Closures":
+        """The same closures in the plane."""
+        group = group_of(self.T_i_j)
+        return Closures(
+            self.i, self.j, group.to_plane(self.T_i_j), group.planar_information(self.information), self.tags
+        )
 
     def select(self, rows: NDArray[np.int64]) -> "Closures":
         """The closures with the indices ``rows``, shape (S,)."""
@@ -68,10 +75,11 @@ def pairwise_consistency(a: Trajectory, b: Trajectory, closures: Closures) -> ND
     """Which pairs of K closures between two trajectories are consistent, shape (K, K), symmetric."""
     _check(closures.i, len(a), "a")
     _check(closures.j, len(b), "b")
+    limit = group_of(closures.T_i_j).chi2_limit
     k, m = np.triu_indices(len(closures), 1)
     consistent = np.eye(len(closures), dtype=bool)
     for part in np.array_split(np.arange(len(k)), len(k) // _PAIRS_AT_ONCE + 1):
-        consistent[k[part], m[part]] = loop_chi2(a, b, closures, k[part], m[part]) <= CHI2_LIMIT
+        consistent[k[part], m[part]] = loop_chi2(a, b, closures, k[part], m[part]) <= limit
     return consistent | consistent.T
 
 
@@ -89,7 +97,7 @@ def count_supporting_closures(a: Trajectory, b: Trajectory, closures: Closures) 
         travel_m = path.travel_m[end]
         near &= np.abs(travel_m[:, None] - travel_m[None]) <= SUPPORT_M
     k, m = np.nonzero(np.triu(near, 1))
-    consistent = loop_chi2(a, b, closures, k, m) <= CHI2_LIMIT
+    consistent = loop_chi2(a, b, closures, k, m) <= group_of(closures.T_i_j).chi2_limit
     return np.bincount(np.concatenate((k[consistent], m[consistent])), minlength=len(closures))
 
 
@@ -98,13 +106,13 @@ def loop_chi2(
 ) -> FloatArray:
     """Squared Mahalanobis length (P,) of loops: back over closure k, along a, over closure m, back along b.
 
-    ``k`` and ``m`` are the rows of the two closures of each loop. The result has three degrees of freedom.
+    ``k`` and ``m`` are the rows of the two closures of each loop. The result has as many degrees of freedom as a pose.
     """
-    i, j, T_i_j = closures.i, closures.j, closures.T_i_j
-    along_a = se2.between(a.poses[i[k]], a.poses[i[m]])
-    along_b = se2.between(b.poses[j[m]], b.poses[j[k]])
-    over_b = se2.compose(T_i_j[m], along_b)
-    residual = se2.log(se2.compose(se2.between(T_i_j[k], along_a), over_b))
+    i, j, T_i_j, group = closures.i, closures.j, closures.T_i_j, group_of(closures.T_i_j)
+    along_a = group.between(a.poses[i[k]], a.poses[i[m]])
+    along_b = group.between(b.poses[j[m]], b.poses[j[k]])
+    over_b = group.compose(T_i_j[m], along_b)
+    residual = group.log(group.compose(group.between(T_i_j[k], along_a), over_b))
     # First-order covariance in the tangent space at the loop's end, as if it closed.
     covariance = np.linalg.inv(closures.information).astype(np.float64)
     spread = covariance[k] + transport_covariance(covariance[m], along_b)

@@ -1,7 +1,9 @@
-"""Pose graphs as g2o text (2D).
+"""Pose graphs as g2o text.
 
-    VERTEX_SE2 id x y theta
-    EDGE_SE2 i j x y theta xx xy xt yy yt tt
+    VERTEX_SE2 id x y theta                        VERTEX_SE3:QUAT id x y z qx qy qz qw
+    EDGE_SE2 i j x y theta xx xy xt yy yt tt       EDGE_SE3:QUAT i j x y z qx qy qz qw, and 21 numbers of information
+
+In space, g2o measures rotations by the vector of their quaternion, half the angle of ours.
 
 The format does not mark closures: an edge between two consecutive ids is odometry, all others are closures.
 """
@@ -10,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fcslam.geometry.groups import SE2
 from fcslam.graph.pose_graph import PoseGraph
 
 
@@ -22,11 +25,15 @@ def g2o_text(graph: PoseGraph, ids: Sequence[int]) -> str:
     """
     if len(ids) != len(graph) or len(set(ids)) != len(ids):
         raise ValueError(f"{len(graph)} variables need as many different ids, not {len(ids)}")
-    lines = [f"VERTEX_SE2 {name} {_text(pose)}" for name, pose in sorted(zip(ids, graph.poses().tolist(), strict=True))]
-    edges, (row, column) = graph.given(), np.triu_indices(3)
-    numbers = np.hstack((edges.T_i_j, edges.information[:, row, column])).tolist()
+    kind, half = ("SE2", 1.0) if graph.group is SE2 else ("SE3:QUAT", 2.0)
+    poses = sorted(zip(ids, graph.poses().tolist(), strict=True))
+    lines = [f"VERTEX_{kind} {name} {_text(pose)}" for name, pose in poses]
+    edges, (row, column) = graph.given(), np.triu_indices(graph.group.freedom)
+    unit = graph.group.sigmas(1.0, half)
+    information = edges.information * np.outer(unit, unit)
+    numbers = np.hstack((edges.T_i_j, information[:, row, column])).tolist()
     for i, j, values in zip(edges.i.tolist(), edges.j.tolist(), numbers, strict=True):
-        lines.append(f"EDGE_SE2 {ids[i]} {ids[j]} {_text(values)}")
+        lines.append(f"EDGE_{kind} {ids[i]} {ids[j]} {_text(values)}")
     return "\n".join(lines) + "\n"
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2, group_of
 from fcslam.graph.bridges import contradicted_bridges
 from fcslam.graph.cluster import (
     ClusterDecision,
@@ -35,10 +35,10 @@ the numbers of the robots, their own trajectories, and the closures."""
 
 CompareJointMaps = Callable[[int, int, FloatArray, FloatArray], MapFit]
 """Compares the maps of two robots at joint poses. It takes the numbers of the robots and the poses of their variables,
-shape (N, 3) each."""
+shape (N, P) each."""
 
 _Relation = tuple[int, int, FloatArray]
-"""Two robots a and b, and the transform T_a_b between their own frames, shape (3,)."""
+"""Two robots a and b, and the transform T_a_b between their own frames, shape (P,)."""
 
 PREDICTED_M, PREDICTED_RAD = 1.0, 0.26
 """Largest median difference between a cluster and the transform that other links predict."""
@@ -79,7 +79,7 @@ class Link:
     closures: Closures
     """The same K closures, from a to b."""
     T_a_b: FloatArray
-    """Transform between the robots' own frames by the largest cluster, shape (3,)."""
+    """Transform between the robots' own frames by the largest cluster, shape (P,)."""
 
     @property
     def members(self) -> NDArray[np.int64]:
@@ -92,7 +92,7 @@ class JointSolution:
     """Poses of all robots and the weight of every closure."""
 
     poses: FloatArray
-    """Shape (N, 3), each in the frame of its map; the first pose of its first robot stays where the graph has it."""
+    """Shape (N, P), each in the frame of its map; the first pose of its first robot stays where the graph has it."""
     weights: FloatArray
     """Shape (E,): 1 for inliers and odometry, 0 for outliers."""
     maps: tuple[int, ...]
@@ -102,7 +102,7 @@ class JointSolution:
     joining: tuple[Link, ...]
     """Those with a dominant cluster. Where other links predict it, the maps of these robots were not compared."""
     own: tuple[FloatArray, ...]
-    """Poses of each robot from its own measurements alone, shape (N_k, 3); the first stays where the graph has it."""
+    """Poses of each robot from its own measurements alone, shape (N_k, P); the first stays where the graph has it."""
     apart: Mapping[tuple[int, int], Reason]
     """Pairs of robots a < b that closures would join, and that stay apart because maps contradict each other."""
 
@@ -128,7 +128,7 @@ def solve_jointly(
         compare: called for robots of one map that only one other sender connects.
 
     Returns:
-        Poses (N, 3), weights (E,), and the maps.
+        Poses (N, P), weights (E,), and the maps.
     """
     # 1. Optimize each robot's own graph.
     initial = evidence.graph.poses()
@@ -237,11 +237,11 @@ def _known_transforms(evidence: JointEvidence, own: Sequence[Trajectory]) -> lis
     """Transforms between the robots' own frames by the edges between robots that are known to be true."""
     edges, (owner, index) = evidence.graph.arrays(), _owners(evidence)
     between = np.flatnonzero(~edges.robust & (owner[edges.i] != owner[edges.j]))
-    relations: list[_Relation] = []
+    relations, group = list[_Relation](), evidence.graph.group
     for i, j, T_i_j in zip(edges.i[between], edges.j[between], edges.T_i_j[between], strict=True):
         a, b = int(owner[i]), int(owner[j])
         T_a_i, T_b_j = own[a].poses[index[i]], own[b].poses[index[j]]
-        relations.append((a, b, se2.compose(se2.compose(T_a_i, T_i_j), se2.inverse(T_b_j))))
+        relations.append((a, b, group.compose(group.compose(T_a_i, T_i_j), group.inverse(T_b_j))))
     return relations
 
 
@@ -253,7 +253,8 @@ def _merge_frames(
 
     To compare maps takes longest. Of robots in one map already, only those are compared whose link lies elsewhere.
     """
-    frames, maps = [np.zeros(3) for _ in own], list(range(len(own)))
+    group = group_of(own[0].poses) if own else SE2
+    frames, maps = [group.identity.copy() for _ in own], list(range(len(own)))
     joining: list[Link] = []
 
     def merge(a: int, b: int, T_a_b: FloatArray) -> None:
@@ -261,16 +262,17 @@ def _merge_frames(
         if older == younger:
             return
         # T_mapA_mapB, through the two robots
-        T = se2.compose(se2.compose(frames[a], T_a_b), se2.inverse(frames[b]))
-        T = T if maps[a] == older else se2.inverse(T)
+        T = group.compose(group.compose(frames[a], T_a_b), group.inverse(frames[b]))
+        T = T if maps[a] == older else group.inverse(T)
         for robot in (robot for robot, number in enumerate(maps) if number == younger):
-            frames[robot], maps[robot] = se2.compose(T, frames[robot]), older
+            frames[robot], maps[robot] = group.compose(T, frames[robot]), older
 
     def is_predicted(link: Link) -> bool:
         members = link.closures.select(np.array(link.decision.members, dtype=np.int64))
-        T_map_i = se2.compose(frames[link.a], own[link.a].poses[members.i])
-        T_map_j = se2.compose(frames[link.b], own[link.b].poses[members.j])
-        x, y, theta = np.median(np.abs(se2.between(se2.between(T_map_i, T_map_j), members.T_i_j)), axis=0)
+        T_map_i = group.compose(frames[link.a], own[link.a].poses[members.i])
+        T_map_j = group.compose(frames[link.b], own[link.b].poses[members.j])
+        off = group.to_plane(group.between(group.between(T_map_i, T_map_j), members.T_i_j))
+        x, y, theta = np.median(np.abs(off), axis=0)
         return bool(np.hypot(x, y) <= PREDICTED_M and theta <= PREDICTED_RAD)
 
     for relation in known:
@@ -320,7 +322,7 @@ def _solve_supported(
     graph = evidence.graph
     start = graph.poses()
     for robot, path, frame in zip(evidence.robots, own, frames, strict=True):
-        start[robot] = se2.compose(frame, path.poses)
+        start[robot] = graph.group.compose(frame, path.poses)
     subgraph = graph.restricted(start, supported)
     solution = optimize_gnc(subgraph, start)
     if joined and not solution.weights.all():

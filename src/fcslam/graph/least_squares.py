@@ -15,8 +15,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.geometry.groups import Group
 from fcslam.graph.cholesky import find_structure, solve
-from fcslam.graph.pose_graph import EdgeArrays, Group
+from fcslam.graph.pose_graph import EdgeArrays
 from fcslam.records import FloatArray
 
 CAUCHY_WIDTH = 2.385

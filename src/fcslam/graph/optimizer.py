@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2
 from fcslam.graph.least_squares import Loss, minimize
-from fcslam.graph.pose_graph import CHI2_LIMIT, SE2, EdgeArrays, PoseGraph
+from fcslam.graph.pose_graph import EdgeArrays, PoseGraph
 from fcslam.records import FloatArray, frozen
 
 _MAXIMUM_ITERATIONS = 100
@@ -33,7 +34,7 @@ class Solution:
     """Optimized poses and the weight of each edge."""
 
     poses: FloatArray
-    """Shape (N, 3), metres and radians."""
+    """Shape (N, P)."""
     weights: FloatArray
     """Shape (E,), in [0, 1]; 1 for odometry."""
     iterations: int
@@ -52,11 +53,11 @@ def optimize(
 
     Args:
         graph: N variables and E edges.
-        initial: poses to start from, shape (N, 3), metres and radians; None: the graph's own.
+        initial: poses to start from, shape (N, P); None: the graph's own.
         loss: loss of the closures.
 
     Returns:
-        Poses (N, 3) and weights (E,).
+        Poses (N, P) and weights (E,).
     """
     steps = _Steps(graph, initial)
     chi2 = steps.solve(np.ones_like(steps.chi2()), _MAXIMUM_ITERATIONS, loss)
@@ -79,7 +80,7 @@ def optimize_gnc(
     """
     steps = _Steps(graph, initial)
     _graduate(steps, steps.solve(np.ones_like(steps.chi2()), _FIRST_ITERATIONS))
-    return _alternate(steps, (steps.chi2() <= CHI2_LIMIT).astype(np.float64))
+    return _alternate(steps, (steps.chi2() <= steps.limit).astype(np.float64))
 
 
 def refine_inliers(
@@ -105,10 +106,10 @@ class _Steps:
 
     def __init__(self, graph: PoseGraph, initial: ArrayLike | None) -> None:
         self.poses = graph.poses() if initial is None else np.array(initial, dtype=np.float64)
-        if self.poses.shape != (len(graph), 3) or not np.isfinite(self.poses).all():
-            shape = self.poses.shape
-            raise ValueError(f"initial poses must be finite and of shape ({len(graph)}, 3), not {shape}")
-        self.cost = 0.0
+        needed, shape = (len(graph), graph.group.size), self.poses.shape
+        if shape != needed or not np.isfinite(self.poses).all():
+            raise ValueError(f"initial poses must be finite and of shape {needed}, not {shape}")
+        self.cost, self.limit = 0.0, graph.group.chi2_limit
         self._graph, self._start, self._iterations = graph, self.poses, 0
         self._robust = np.flatnonzero(graph.arrays().robust)
         self._optimal_for: FloatArray | None = None
@@ -121,7 +122,9 @@ class _Steps:
             edges = self._graph.arrays().select(scale > 0.0)
             edges = replace(edges, information=edges.information * scale[scale > 0.0, None, None])
             held = self._graph.components(scale > 0.0) == np.arange(len(self.poses))
-            self.poses, used, self.cost = minimize(SE2, edges, self.poses, held, loss=loss, iterations=iterations)
+            self.poses, used, self.cost = minimize(
+                self._graph.group, edges, self.poses, held, loss=loss, iterations=iterations
+            )
             self._iterations += used
             self._optimal_for = weights if used < iterations else None
         return self.chi2()
@@ -132,16 +135,16 @@ class _Steps:
 
     def solution(self, weights: FloatArray, cost: float) -> Solution:
         """The poses, each connected component moved so that its first variable is where it started."""
-        scale, start, poses = self._scale(weights), self._start, self.poses
+        scale, start, poses, group = self._scale(weights), self._start, self.poses, self._graph.group
         first = self._graph.components(scale > 0.0)
-        moved = se2.compose(se2.compose(start[first], se2.inverse(poses[first])), poses)
+        moved = group.compose(group.compose(start[first], group.inverse(poses[first])), poses)
         moved[first] = start[first]
         return Solution(frozen(moved), frozen(scale), self._iterations, cost)
 
     def truncated_cost(self) -> float:
         """Cost with the truncated squared loss on closures."""
         chi2 = self._graph.chi2(self.poses)
-        chi2[self._robust] = np.minimum(chi2[self._robust], CHI2_LIMIT)
+        chi2[self._robust] = np.minimum(chi2[self._robust], self.limit)
         return 0.5 * float(chi2.sum())
 
     def _scale(self, weights: FloatArray) -> FloatArray:
@@ -153,11 +156,11 @@ class _Steps:
 
 def _graduate(steps: _Steps, chi2: FloatArray) -> None:
     largest = chi2.max(initial=0.0)
-    if largest <= CHI2_LIMIT:
+    if largest <= steps.limit:
         return
-    mu = CHI2_LIMIT / (2.0 * largest - CHI2_LIMIT)
+    mu = steps.limit / (2.0 * largest - steps.limit)
     for _ in range(_MAXIMUM_ITERATIONS):  # closures that are then still undecided are decided by their residuals
-        weights = _truncated_weights(chi2, mu)
+        weights = _truncated_weights(chi2, mu, steps.limit)
         if np.all((weights < _BINARY) | (weights > 1.0 - _BINARY)):
             return
         chi2 = steps.solve(weights, iterations=1)
@@ -167,7 +170,7 @@ def _graduate(steps: _Steps, chi2: FloatArray) -> None:
 def _alternate(steps: _Steps, weights: FloatArray) -> Solution:
     """Alternate solve and decision until no decision changes, each of which lowers the truncated loss."""
     for _ in range(_REFINEMENT_ROUNDS):
-        decided = (steps.solve(weights, _MAXIMUM_ITERATIONS) <= CHI2_LIMIT).astype(np.float64)
+        decided = (steps.solve(weights, _MAXIMUM_ITERATIONS) <= steps.limit).astype(np.float64)
         if np.array_equal(decided, weights):
             break
         weights = decided
@@ -175,10 +178,10 @@ def _alternate(steps: _Steps, weights: FloatArray) -> Solution:
     return steps.solution(weights, steps.truncated_cost())
 
 
-def _truncated_weights(chi2: FloatArray, mu: float) -> FloatArray:
-    """Weights of the surrogate of the truncated squared loss at ``mu`` (Yang et al. 2020, eq. 14)."""
+def _truncated_weights(chi2: FloatArray, mu: float, limit: float) -> FloatArray:
+    """Weights of the surrogate of the squared loss truncated at ``limit``, at ``mu`` (Yang et al. 2020, eq. 14)."""
     with np.errstate(divide="ignore"):
-        between = np.sqrt(CHI2_LIMIT * mu * (mu + 1.0) / chi2) - mu
+        between = np.sqrt(limit * mu * (mu + 1.0) / chi2) - mu
     return np.clip(between, 0.0, 1.0)
 
 

@@ -1,14 +1,14 @@
-"""A pose graph in the plane: variables numbered from 0, measured motions between them. It only grows."""
+"""A pose graph: variables numbered from 0, measured motions between them. It only grows."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Generic, NamedTuple, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fcslam.compiled import njit
-from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2, Group, group_of
 from fcslam.records import FloatArray, frozen
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -24,34 +24,6 @@ _MINIMUM_INFORMATION = 1e-12 * MAXIMUM_INFORMATION
 
 _ASYMMETRY = 1e-6
 """Largest relative asymmetry of an information matrix that counts as rounding."""
-
-PROBABILITY = 0.99
-"""Probability with which the error of a true closure passes the chi-square test."""
-CHI2_LIMIT = 11.344866730144373
-"""Chi-square of a motion, with its three degrees of freedom, for this probability."""
-
-
-class Group(NamedTuple):
-    """A group of rigid motions, as least squares on it sees it: functions of arrays with one pose each row."""
-
-    residual: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
-    """``r = log(T^-1 x_i^-1 x_j)`` of measurements T and poses x_i and x_j, shape (E, d)."""
-    jacobians: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-    """Of r, x_i and x_j: ``A`` and ``B``, shape (E, d, d); a step changes the residual by ``A d_i + B d_j``."""
-    retract: Callable[[FloatArray, FloatArray], FloatArray]
-    """``x exp(d)`` of poses x and a step d, shape (N, d)."""
-
-
-def _residual(T_i_j: FloatArray, x_i: FloatArray, x_j: FloatArray) -> FloatArray:
-    return se2.log(se2.between(T_i_j, se2.between(x_i, x_j)))
-
-
-def _jacobians(residual: FloatArray, x_i: FloatArray, x_j: FloatArray) -> tuple[FloatArray, FloatArray]:
-    of_j = se2.log_jacobian(residual)
-    return -of_j @ se2.adjoint(se2.between(x_j, x_i)), of_j
-
-
-SE2 = Group(_residual, _jacobians, lambda poses, step: se2.compose(poses, se2.exp(step)))
 
 
 class Rows(Generic[Scalar]):
@@ -90,9 +62,9 @@ class Edge:
     i: int
     j: int
     T_i_j: FloatArray
-    """Pose of j in i, shape (3,)."""
+    """Pose of j in i, shape (3,) or (7,)."""
     information: FloatArray
-    """Inverse covariance of T_i_j in the tangent space at T_i_j (x, y, theta of j), shape (3, 3)."""
+    """Inverse covariance of T_i_j in the tangent space at T_i_j, shape (3, 3) or (6, 6)."""
     robust: bool
     """Whether the edge may be false (a closure); odometry is trusted."""
 
@@ -100,8 +72,9 @@ class Edge:
         where = f"edge {self.i} -> {self.j}"
         if self.i == self.j or min(self.i, self.j) < 0:
             raise ValueError(f"{where}: connects two different variables, numbered from 0")
-        object.__setattr__(self, "T_i_j", frozen(_checked(self.T_i_j, (3,), f"{where}: T_i_j")))
-        object.__setattr__(self, "information", frozen(_positive_definite(self.information, where)))
+        group = group_of(np.asarray(self.T_i_j))
+        object.__setattr__(self, "T_i_j", frozen(_checked(self.T_i_j, (group.size,), f"{where}: T_i_j")))
+        object.__setattr__(self, "information", frozen(_positive_definite(self.information, group.freedom, where)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,26 +92,27 @@ class EdgeArrays:
         return EdgeArrays(self.i[rows], self.j[rows], self.T_i_j[rows], self.information[rows], self.robust[rows])
 
 
-_NO_EDGES = EdgeArrays(
-    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, bool)
-)
+def _no_edges(group: Group) -> EdgeArrays:
+    ends, d = np.zeros(0, np.int64), group.freedom
+    return EdgeArrays(ends, ends, np.zeros((0, group.size)), np.zeros((0, d, d)), np.zeros(0, bool))
 
 
 class PoseGraph:
-    """Variables with initial poses, shape (N, 3), and edges between them; append-only."""
+    """Variables with initial poses, shape (N, P), and edges between them; append-only."""
 
-    def __init__(self, poses: ArrayLike = (), edges: Iterable[Edge] = ()) -> None:
-        self._poses = Rows(np.zeros((0, 3)))
-        self._set_edges(_NO_EDGES)
-        for pose in np.asarray(poses, dtype=np.float64).reshape(-1, 3):
+    def __init__(self, poses: ArrayLike = (), edges: Iterable[Edge] = (), group: Group = SE2) -> None:
+        self.group = group
+        self._poses = Rows(np.zeros((0, group.size)))
+        self._set_edges(_no_edges(group))
+        for pose in np.asarray(poses, dtype=np.float64).reshape(-1, group.size):
             self.add_variable(pose)
         for edge in edges:
             self.add_edge(edge)
 
     @classmethod
     def restored(cls, poses: FloatArray, edges: EdgeArrays) -> Self:
-        """A graph from the poses (N, 3) and edges of another one, which were checked when they were added to it."""
-        graph = cls()
+        """A graph from the poses (N, P) and edges of another one, which were checked when they were added to it."""
+        graph = cls(group=group_of(poses))
         graph._poses = Rows(poses)
         graph._set_edges(edges)
         return graph
@@ -170,8 +144,8 @@ class PoseGraph:
         ]
 
     def add_variable(self, pose: ArrayLike) -> int:
-        """Append a variable with its initial pose (3,); returns its number."""
-        return self._poses.append(_checked(pose, (3,), f"variable {len(self)}"))
+        """Append a variable with its initial pose (P,); returns its number."""
+        return self._poses.append(_checked(pose, (self.group.size,), f"variable {len(self)}"))
 
     def add_edge(self, edge: Edge) -> int:
         """Append an edge; returns its number."""
@@ -187,7 +161,7 @@ class PoseGraph:
         return self._information.append(edge.information)
 
     def poses(self) -> FloatArray:
-        """Initial poses, shape (N, 3)."""
+        """Initial poses, shape (N, P)."""
         return self._poses.values.copy()
 
     def given(self) -> EdgeArrays:
@@ -210,7 +184,7 @@ class PoseGraph:
     def restricted(
         self, poses: FloatArray, kept: NDArray[np.bool_], variables: NDArray[np.bool_] | None = None
     ) -> "PoseGraph":
-        """The graph at ``poses`` (N, 3) with the edges where ``kept`` (E,) is true.
+        """The graph at ``poses`` (N, P) with the edges where ``kept`` (E,) is true.
 
         ``variables`` (N,) marks those that stay, with new numbers, and the edges between them; None: all.
         """
@@ -221,13 +195,13 @@ class PoseGraph:
         return PoseGraph.restored(poses[variables], replace(edges, i=number[edges.i], j=number[edges.j]))
 
     def chi2(self, poses: ArrayLike | None = None, rows: NDArray[np.int64] | None = None) -> FloatArray:
-        """Squared Mahalanobis length of the edges' residuals at ``poses`` (N, 3); None: initial poses.
+        """Squared Mahalanobis length of the edges' residuals at ``poses`` (N, P); None: initial poses.
 
         Shape (E,), or (K,) of some ``rows``, shape (K,).
         """
         x = self.poses() if poses is None else np.asarray(poses, dtype=np.float64)
         edges, chosen = self.arrays(), slice(None) if rows is None else rows
-        residual = SE2.residual(edges.T_i_j[chosen], x[edges.i[chosen]], x[edges.j[chosen]])
+        residual = self.group.residual(edges.T_i_j[chosen], x[edges.i[chosen]], x[edges.j[chosen]])
         chi2: FloatArray = np.einsum("ea,eab,eb->e", residual, edges.information[chosen], residual)
         return chi2
 
@@ -262,7 +236,7 @@ def _root(first, variable):  # type: ignore[no-untyped-def]
 
 
 def _bounded(information: FloatArray) -> FloatArray:
-    """Information (E, 3, 3) with eigenvalues at most MAXIMUM_INFORMATION."""
+    """Information (E, d, d) with eigenvalues at most MAXIMUM_INFORMATION."""
     values, vectors = np.linalg.eigh(information)
     values = np.clip(values, _MINIMUM_INFORMATION, MAXIMUM_INFORMATION)
     bounded: FloatArray = np.einsum("eab,eb,ecb->eac", vectors, values, vectors)
@@ -276,15 +250,16 @@ def _checked(values: ArrayLike, shape: tuple[int, ...], what: str) -> FloatArray
     return array
 
 
-def _positive_definite(information: ArrayLike, where: str) -> FloatArray:
-    matrix = _checked(information, (3, 3), f"{where}: information")
-    (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = matrix.tolist()  # without arrays: thousands of edges come one by one
-    largest = max(map(abs, (xx, xy, xt, yx, yy, yt, tx, ty, tt)))
-    if max(abs(xy - yx), abs(xt - tx), abs(yt - ty)) > _ASYMMETRY * largest:
-        raise ValueError(f"{where}: information is not symmetric: {matrix.tolist()}")
+def _positive_definite(information: ArrayLike, freedom: int, where: str) -> FloatArray:
+    matrix = _checked(information, (freedom, freedom), f"{where}: information")
+    rows = matrix.tolist()  # without arrays: thousands of edges come one by one
+    largest = max(abs(number) for row in rows for number in row)
+    upper = ((r, c) for r in range(freedom) for c in range(r + 1, freedom))
+    if max(abs(rows[r][c] - rows[c][r]) for r, c in upper) > _ASYMMETRY * largest:
+        raise ValueError(f"{where}: information is not symmetric: {rows}")
     symmetric = 0.5 * (matrix + matrix.T)
     try:
         np.linalg.cholesky(symmetric)
     except np.linalg.LinAlgError:
-        raise ValueError(f"{where}: information is not positive definite: {matrix.tolist()}") from None
+        raise ValueError(f"{where}: information is not positive definite: {rows}") from None
     return symmetric

@@ -29,7 +29,7 @@ def solve_single_robot(graph: PoseGraph) -> Solution:
         graph: N variables and E edges of one robot.
 
     Returns:
-        Poses (N, 3) in the frame of the first variable, and weights (E,).
+        Poses (N, P) in the frame of the first variable, and weights (E,).
     """
     robust = graph.arrays().robust
     odometry = initialize(graph, (~robust).astype(float))
@@ -54,9 +54,9 @@ def solve_single_robot(graph: PoseGraph) -> Solution:
 
 
 def robot_trajectory(graph: PoseGraph, poses: FloatArray) -> Trajectory:
-    """The trajectory of one robot through ``poses`` (N, 3), with the covariance of the odometry of its graph."""
+    """The trajectory of one robot through ``poses`` (N, P), with the covariance of the odometry of its graph."""
     edges = graph.arrays()
-    covariance = np.tile(_UNMEASURED_VARIANCE * np.eye(3), (max(0, len(graph) - 1), 1, 1))
+    covariance = np.tile(_UNMEASURED_VARIANCE * np.eye(graph.group.freedom), (max(0, len(graph) - 1), 1, 1))
     steps = ~edges.robust & (edges.j == edges.i + 1)
     covariance[edges.i[steps]] = np.linalg.inv(edges.information[steps])
     return build_trajectory(poses, covariance)

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2
 from fcslam.graph.cholesky import find_structure, marginal_covariance
-from fcslam.graph.pose_graph import SE2, Edge, PoseGraph
+from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.verification import CLOSURE_SIGMA_M
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, pixels_of
 from fcslam.records import FloatArray

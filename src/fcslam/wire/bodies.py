@@ -8,6 +8,7 @@ import numpy as np
 from google.protobuf.message import Message
 
 from fcslam.errors import PacketError
+from fcslam.geometry.voxels import MOST_POINTS, are_inside
 from fcslam.records import (
     SWEEP_STEPS,
     Beams,
@@ -26,6 +27,7 @@ from fcslam.records import (
     Tag,
     TagFamily,
     TagSighting,
+    VoxelMap,
     frozen,
 )
 from fcslam.wire import fcslam_pb2 as pb
@@ -43,9 +45,11 @@ from fcslam.wire.streams import (
     ascending,
     pack_descriptors,
     pack_keypoints,
+    pack_points,
     pack_ranges,
     unpack_descriptors,
     unpack_keypoints,
+    unpack_points,
     unpack_ranges,
 )
 
@@ -125,7 +129,7 @@ def _write_constraint(constraint: Constraint) -> pb.Constraint:
         i=constraint.i,
         j=constraint.j,
         kind=_CONSTRAINT_KINDS[constraint.kind],
-        t_i_j=_write_pose(constraint.T_i_j),
+        **_pose_field("t_i_j", constraint.T_i_j),
         information=pack_information(constraint.information),
     )
 
@@ -134,13 +138,14 @@ def _read_constraint(message: pb.Constraint, envelope: pb.Packet) -> Constraint:
     kind = _CONSTRAINT_KIND_OF_CODE.get(message.kind)
     if kind is None:
         raise PacketError(f"constraint: kind {message.kind} is unknown")
-    information = _read_information(message.information, "constraint")
-    return Constraint(envelope.robot, message.i, message.j, kind, _read_pose(message, "t_i_j"), information)
+    T_i_j = _read_pose_field(message, "t_i_j")
+    information = _read_information(message.information, "constraint", 6 if len(T_i_j) == 3 else 21)
+    return Constraint(envelope.robot, message.i, message.j, kind, T_i_j, information)
 
 
-def _read_information(numbers: Sequence[float], what: str) -> FloatArray:
-    if len(numbers) != 6:
-        raise PacketError(f"{what}: information has {len(numbers)} numbers, not 6")
+def _read_information(numbers: Sequence[float], what: str, count: int = 6) -> FloatArray:
+    if len(numbers) != count:
+        raise PacketError(f"{what}: information has {len(numbers)} numbers, not {count}")
     return unpack_information(numbers)
 
 
@@ -202,6 +207,35 @@ def _read_fix(message: pb.KeyscanFix, envelope: pb.Packet) -> KeyscanFix:
     return KeyscanFix(KeyscanId(envelope.robot, message.number), antenna_xy=antenna_xy, **_values(message, _OF_FIX))
 
 
+def _write_voxel_map(local: VoxelMap) -> pb.VoxelMap:
+    return pb.VoxelMap(
+        number=local.id.number,
+        first=local.first,
+        last=local.last,
+        t_base_ground=_write_space_pose(local.T_base_ground),
+        count=len(local.points),
+        points=pack_points(local.points),
+        origins=local.origins.ravel().tolist(),
+    )
+
+
+def _read_voxel_map(message: pb.VoxelMap, envelope: pb.Packet) -> VoxelMap:
+    _check_at_most(message.count, MOST_POINTS, "voxel map: points")
+    _check_at_most(len(message.origins), 3 * limits.MAXIMUM_ORIGINS, "voxel map: coordinates of origins")
+    points = unpack_points(message.points, message.count)
+    origins = np.array(message.origins, np.int64)
+    if len(origins) % 3 or not are_inside(origins.reshape(-1, 3)):
+        raise PacketError("voxel map: an origin is incomplete or outside the bounds")
+    return VoxelMap(
+        KeyscanId(envelope.robot, message.number),
+        message.first,
+        message.last,
+        _read_space_pose(message, "t_base_ground"),
+        frozen(points, np.int16),
+        frozen(origins.reshape(-1, 3), np.int16),
+    )
+
+
 def _check_at_most(count: int, most: int, what: str) -> None:
     """Refuse a count before memory is allocated for it."""
     if count > most:
@@ -209,11 +243,11 @@ def _check_at_most(count: int, most: int, what: str) -> None:
 
 
 def _write_correction(correction: Correction) -> pb.Correction:
-    return pb.Correction(t_map_odom=_write_pose(correction.T_map_odom), **_values(correction, _OF_CORRECTION))
+    return pb.Correction(**_pose_field("t_map_odom", correction.T_map_odom), **_values(correction, _OF_CORRECTION))
 
 
 def _read_correction(message: pb.Correction, envelope: pb.Packet) -> Correction:
-    pose = _read_pose(message, "t_map_odom")
+    pose = _read_pose_field(message, "t_map_odom")
     return Correction(envelope.robot, T_map_odom=pose, **_values(message, _OF_CORRECTION))
 
 
@@ -264,6 +298,31 @@ def _read_pose(message: Message, field: str) -> FloatArray:
     return frozen((pose.x_m, pose.y_m, pose.theta_rad))
 
 
+def _write_space_pose(pose: FloatArray) -> pb.SpacePose:
+    x, y, z, qx, qy, qz, qw = pose.tolist()
+    return pb.SpacePose(x_m=x, y_m=y, z_m=z, qx=qx, qy=qy, qz=qz, qw=qw)
+
+
+def _read_space_pose(message: Message, field: str) -> FloatArray:
+    if not message.HasField(field):
+        raise PacketError(f"{message.DESCRIPTOR.name.lower()}: {field} is missing")
+    pose: pb.SpacePose = getattr(message, field)
+    return frozen((pose.x_m, pose.y_m, pose.z_m, pose.qx, pose.qy, pose.qz, pose.qw))
+
+
+def _pose_field(name: str, pose: FloatArray) -> dict[str, Any]:
+    """A pose in the field of its group."""
+    return {name: _write_pose(pose)} if pose.shape == (3,) else {f"{name}_space": _write_space_pose(pose)}
+
+
+def _read_pose_field(message: Message, name: str) -> FloatArray:
+    if not message.HasField(f"{name}_space"):
+        return _read_pose(message, name)
+    if message.HasField(name):
+        raise PacketError(f"{message.DESCRIPTOR.name.lower()}: {name} is there twice")
+    return _read_space_pose(message, f"{name}_space")
+
+
 def read_channel(code: int) -> Channel:
     """The channel of a code in a packet."""
     channel = _CHANNEL_OF_CODE.get(code)
@@ -279,6 +338,7 @@ CODECS: dict[PacketKind, tuple[type, Callable[[Any], Message], Callable[[Any, pb
     PacketKind.PLACE: (Place, _write_place, _read_place),
     PacketKind.TAG_SIGHTING: (TagSighting, _write_tag_sighting, _read_tag_sighting),
     PacketKind.KEYSCAN_FIX: (KeyscanFix, _write_fix, _read_fix),
+    PacketKind.VOXEL_MAP: (VoxelMap, _write_voxel_map, _read_voxel_map),
     PacketKind.CORRECTION: (Correction, _write_correction, _read_correction),
     PacketKind.ACKNOWLEDGEMENT: (Acknowledgement, _write_acknowledgement, _read_acknowledgement),
     PacketKind.DETECTOR_UPDATE: (DetectorUpdate, _write_detector_update, _read_detector_update),

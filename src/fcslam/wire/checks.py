@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
 from fcslam.geometry.beams import FULL_TURN_RAD, LARGEST_SPAN_RAD
+from fcslam.geometry.voxels import MOST_POINTS, are_inside, voxel_keys
 from fcslam.records import (
     CODE_BYTES,
     FLOOR,
@@ -23,10 +24,11 @@ from fcslam.records import (
     Place,
     Sweep,
     TagSighting,
+    VoxelMap,
 )
 from fcslam.wire import limits
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
-from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise
+from fcslam.wire.quantisation import MAXIMUM_KEYPOINT_M, dequantise, pack_information, quantise, unpack_information
 
 _NUMBER = 0, 2**31 - 1
 """Numbers of keyscans, versions and maps."""
@@ -46,6 +48,7 @@ _BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
     Constraint: {"i": _NUMBER, "j": _NUMBER},
     Place: {"id.number": _NUMBER, "first": _NUMBER, "last": _NUMBER},
     TagSighting: {"id.number": _NUMBER, "tag.number": (0, 4095)},
+    VoxelMap: {"id.number": _NUMBER, "first": _NUMBER, "last": _NUMBER},
     KeyscanFix: {
         "id.number": _NUMBER,
         "latitude_deg": (-90.0, 90.0),
@@ -70,7 +73,7 @@ def check(packet: Packet) -> None:
     check_name(packet.robot, "robot")
     _check_numbers(packet)
     _require(math.isfinite(packet.time), "time is not finite")
-    robot = body.id.robot if isinstance(body, Keyscan | Place | TagSighting | KeyscanFix) else body.robot
+    robot = body.id.robot if isinstance(body, Keyscan | Place | TagSighting | KeyscanFix | VoxelMap) else body.robot
     _require(robot == packet.robot, f"a packet of robot {packet.robot} holds a record of robot {robot!r}")
     _check_numbers(body)
     match body:
@@ -82,10 +85,12 @@ def check(packet: Packet) -> None:
             _require(body.stamp <= packet.time, "keyscan: stamp is later than the packet's time")
         case Constraint():
             _require(body.i < body.j, f"constraint: i = {body.i} is not below j = {body.j}")
-            _check_pose(body.T_i_j, "constraint: T_i_j", math.pi)
-            _check_information(body.information, "constraint")
+            _check_motion(body.T_i_j, "constraint: T_i_j")
+            _check_information(body.information, "constraint", 3 if body.T_i_j.shape == (3,) else 6)
         case Place():
             _check_place(body)
+        case VoxelMap():
+            _check_voxel_map(body)
         case TagSighting():
             _check_pose(body.T_base_tag, "tag sighting: T_base_tag", math.pi)
             _check_information(body.information, "tag sighting")
@@ -93,7 +98,7 @@ def check(packet: Packet) -> None:
             is_near = math.hypot(*body.antenna_xy) <= _ANTENNA_M
             _require(is_near, f"fix: the antenna is not within {_ANTENNA_M:g} m of the robot")
         case Correction():
-            _check_pose(body.T_map_odom, "correction: T_map_odom", math.pi)
+            _check_motion(body.T_map_odom, "correction: T_map_odom")
         case DetectorUpdate():
             check_name(body.file.version, "detector update: detector version")
             _require(len(body.file.sha256) == 32, f"detector update: sha256 has {len(body.file.sha256)} bytes, not 32")
@@ -159,9 +164,12 @@ def _check_sweep(sweep: Sweep) -> None:
     _require(sweep == sweep.rounded(), "keyscan: the sweep is not in steps of the wire; work with Sweep.rounded()")
 
 
-def _check_information(information: FloatArray, what: str) -> None:
+def _check_information(information: FloatArray, what: str, freedom: int = 3) -> None:
     """Refuse a matrix that is not symmetric or, as rounded and with a unit diagonal, not clearly positive definite."""
-    _check_shape(information, (3, 3), f"{what}: information")
+    _check_shape(information, (freedom, freedom), f"{what}: information")
+    if freedom != 3:
+        _check_large_information(information, what)
+        return
     xx, xy, xt, yy, yt, tt = sent = pack_information(information)
     _require(all(map(math.isfinite, sent)), f"{what}: information is not finite")
     bounded = all(limits.MINIMUM_INFORMATION <= diagonal <= limits.MAXIMUM_INFORMATION for diagonal in (xx, yy, tt))
@@ -184,10 +192,55 @@ def _exceeds(limit: float, xy: float, xt: float, yt: float) -> bool:
     return second > 0.0 and first - xt * xt / first - rest * rest / second > 0.0
 
 
+def _check_large_information(information: FloatArray, what: str) -> None:
+    sent = unpack_information(pack_information(information))
+    _require(bool(np.isfinite(sent).all()), f"{what}: information is not finite")
+    diagonal = sent.diagonal()
+    bounded = bool(((diagonal >= limits.MINIMUM_INFORMATION) & (diagonal <= limits.MAXIMUM_INFORMATION)).all())
+    _require(bounded, f"{what}: a diagonal element of information is not in [2^-20, 2^40]")
+    scale = 1.0 / np.sqrt(np.outer(diagonal, diagonal))
+    _require(bool((np.abs(information - sent) * scale <= 1e-6).all()), f"{what}: information is not symmetric")
+    definite = float(np.linalg.eigvalsh(sent * scale)[0]) >= limits.MINIMUM_CORRELATION_EIGENVALUE
+    _require(definite, f"{what}: information is not clearly positive definite")
+
+
+def _check_voxel_map(local: VoxelMap) -> None:
+    _check_span(local, "voxel map")
+    _check_space_pose(local.T_base_ground, "voxel map: T_base_ground")
+    for name, most in (("points", MOST_POINTS), ("origins", limits.MAXIMUM_ORIGINS)):
+        steps = getattr(local, name)
+        _check_shape(steps, (len(steps), 3), f"voxel map: {name}")
+        _require(steps.dtype == np.int16, f"voxel map: {name} are {steps.dtype}, not int16")
+        _require(0 < len(steps) <= most, f"voxel map: {len(steps)} {name}, not in 1..{most}")
+        _require(are_inside(steps), f"voxel map: {name} are outside the bounds")
+    _require(bool((np.diff(voxel_keys(local.points)) > 0).all()), "voxel map: voxels are not in ascending order")
+
+
+def _check_span(body: Place | VoxelMap, what: str) -> None:
+    _require(body.first <= body.last, f"{what}: first = {body.first} is after last = {body.last}")
+    within = body.first <= body.id.number <= body.last
+    _require(within, f"{what}: number = {body.id.number} is not in {body.first}..{body.last}")
+
+
+def _check_motion(pose: FloatArray, what: str) -> None:
+    """Check a pose in the plane or in space."""
+    if pose.shape == (7,):
+        _check_space_pose(pose, what)
+    else:
+        _check_pose(pose, what, math.pi)
+
+
+def _check_space_pose(pose: FloatArray, what: str) -> None:
+    _check_shape(pose, (7,), what)
+    within = bool((np.abs(pose[:3]) <= limits.MAXIMUM_COORDINATE_M).all())
+    _require(within, f"{what}: not within {limits.MAXIMUM_COORDINATE_M:g} m")
+    is_near = bool((np.abs(pose[3:]) <= 1.0).all())
+    is_unit = is_near and abs(float(np.linalg.norm(pose[3:])) - 1.0) <= 1e-9 and pose[6] >= 0.0
+    _require(is_unit, f"{what}: not a unit quaternion with qw >= 0")
+
+
 def _check_place(place: Place) -> None:
-    _require(place.first <= place.last, f"place: first = {place.first} is after last = {place.last}")
-    within = place.first <= place.id.number <= place.last
-    _require(within, f"place: number = {place.id.number} is not in {place.first}..{place.last}")
+    _check_span(place, "place")
     check_name(place.detector_version, "place: detector version")
     count = len(place.keypoints)
     _require(count <= limits.MAXIMUM_KEYPOINTS, f"place: {count} keypoints, at most {limits.MAXIMUM_KEYPOINTS}")

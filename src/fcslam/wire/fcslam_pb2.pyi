@@ -26,7 +26,7 @@ CONSTRAINT_KIND_ODOMETRY: ConstraintKind
 CONSTRAINT_KIND_CLOSURE: ConstraintKind
 
 class Packet(_message.Message):
-    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "tag_sighting", "keyscan_fix", "correction", "acknowledgement", "detector_update")
+    __slots__ = ("version", "robot", "epoch", "sequence", "time", "hello", "keyscan", "constraint", "place", "tag_sighting", "keyscan_fix", "voxel_map", "correction", "acknowledgement", "detector_update")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     ROBOT_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
@@ -38,6 +38,7 @@ class Packet(_message.Message):
     PLACE_FIELD_NUMBER: _ClassVar[int]
     TAG_SIGHTING_FIELD_NUMBER: _ClassVar[int]
     KEYSCAN_FIX_FIELD_NUMBER: _ClassVar[int]
+    VOXEL_MAP_FIELD_NUMBER: _ClassVar[int]
     CORRECTION_FIELD_NUMBER: _ClassVar[int]
     ACKNOWLEDGEMENT_FIELD_NUMBER: _ClassVar[int]
     DETECTOR_UPDATE_FIELD_NUMBER: _ClassVar[int]
@@ -52,10 +53,11 @@ class Packet(_message.Message):
     place: Place
     tag_sighting: TagSighting
     keyscan_fix: KeyscanFix
+    voxel_map: VoxelMap
     correction: Correction
     acknowledgement: Acknowledgement
     detector_update: DetectorUpdate
-    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., tag_sighting: _Optional[_Union[TagSighting, _Mapping]] = ..., keyscan_fix: _Optional[_Union[KeyscanFix, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., detector_update: _Optional[_Union[DetectorUpdate, _Mapping]] = ...) -> None: ...
+    def __init__(self, version: _Optional[int] = ..., robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., time: _Optional[float] = ..., hello: _Optional[_Union[Hello, _Mapping]] = ..., keyscan: _Optional[_Union[Keyscan, _Mapping]] = ..., constraint: _Optional[_Union[Constraint, _Mapping]] = ..., place: _Optional[_Union[Place, _Mapping]] = ..., tag_sighting: _Optional[_Union[TagSighting, _Mapping]] = ..., keyscan_fix: _Optional[_Union[KeyscanFix, _Mapping]] = ..., voxel_map: _Optional[_Union[VoxelMap, _Mapping]] = ..., correction: _Optional[_Union[Correction, _Mapping]] = ..., acknowledgement: _Optional[_Union[Acknowledgement, _Mapping]] = ..., detector_update: _Optional[_Union[DetectorUpdate, _Mapping]] = ...) -> None: ...
 
 class Pose(_message.Message):
     __slots__ = ("x_m", "y_m", "theta_rad")
@@ -66,6 +68,24 @@ class Pose(_message.Message):
     y_m: float
     theta_rad: float
     def __init__(self, x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., theta_rad: _Optional[float] = ...) -> None: ...
+
+class SpacePose(_message.Message):
+    __slots__ = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    X_M_FIELD_NUMBER: _ClassVar[int]
+    Y_M_FIELD_NUMBER: _ClassVar[int]
+    Z_M_FIELD_NUMBER: _ClassVar[int]
+    QX_FIELD_NUMBER: _ClassVar[int]
+    QY_FIELD_NUMBER: _ClassVar[int]
+    QZ_FIELD_NUMBER: _ClassVar[int]
+    QW_FIELD_NUMBER: _ClassVar[int]
+    x_m: float
+    y_m: float
+    z_m: float
+    qx: float
+    qy: float
+    qz: float
+    qw: float
+    def __init__(self, x_m: _Optional[float] = ..., y_m: _Optional[float] = ..., z_m: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., qw: _Optional[float] = ...) -> None: ...
 
 class Hello(_message.Message):
     __slots__ = ("lasers", "detectors", "floor")
@@ -126,18 +146,20 @@ class Beams(_message.Message):
     def __init__(self, angle_min_rad: _Optional[float] = ..., angle_increment_rad: _Optional[float] = ...) -> None: ...
 
 class Constraint(_message.Message):
-    __slots__ = ("i", "j", "kind", "t_i_j", "information")
+    __slots__ = ("i", "j", "kind", "t_i_j", "information", "t_i_j_space")
     I_FIELD_NUMBER: _ClassVar[int]
     J_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     T_I_J_FIELD_NUMBER: _ClassVar[int]
     INFORMATION_FIELD_NUMBER: _ClassVar[int]
+    T_I_J_SPACE_FIELD_NUMBER: _ClassVar[int]
     i: int
     j: int
     kind: ConstraintKind
     t_i_j: Pose
     information: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, i: _Optional[int] = ..., j: _Optional[int] = ..., kind: _Optional[_Union[ConstraintKind, str]] = ..., t_i_j: _Optional[_Union[Pose, _Mapping]] = ..., information: _Optional[_Iterable[float]] = ...) -> None: ...
+    t_i_j_space: SpacePose
+    def __init__(self, i: _Optional[int] = ..., j: _Optional[int] = ..., kind: _Optional[_Union[ConstraintKind, str]] = ..., t_i_j: _Optional[_Union[Pose, _Mapping]] = ..., information: _Optional[_Iterable[float]] = ..., t_i_j_space: _Optional[_Union[SpacePose, _Mapping]] = ...) -> None: ...
 
 class Place(_message.Message):
     __slots__ = ("number", "channel", "detector_version", "first", "last", "count", "keypoints", "descriptors")
@@ -191,17 +213,37 @@ class KeyscanFix(_message.Message):
     antenna_y_m: float
     def __init__(self, number: _Optional[int] = ..., latitude_deg: _Optional[float] = ..., longitude_deg: _Optional[float] = ..., altitude_m: _Optional[float] = ..., sigma_m: _Optional[float] = ..., antenna_x_m: _Optional[float] = ..., antenna_y_m: _Optional[float] = ...) -> None: ...
 
+class VoxelMap(_message.Message):
+    __slots__ = ("number", "first", "last", "t_base_ground", "count", "points", "origins")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    FIRST_FIELD_NUMBER: _ClassVar[int]
+    LAST_FIELD_NUMBER: _ClassVar[int]
+    T_BASE_GROUND_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    POINTS_FIELD_NUMBER: _ClassVar[int]
+    ORIGINS_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    first: int
+    last: int
+    t_base_ground: SpacePose
+    count: int
+    points: bytes
+    origins: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, number: _Optional[int] = ..., first: _Optional[int] = ..., last: _Optional[int] = ..., t_base_ground: _Optional[_Union[SpacePose, _Mapping]] = ..., count: _Optional[int] = ..., points: _Optional[bytes] = ..., origins: _Optional[_Iterable[int]] = ...) -> None: ...
+
 class Correction(_message.Message):
-    __slots__ = ("version", "map_index", "t_map_odom", "quality")
+    __slots__ = ("version", "map_index", "t_map_odom", "quality", "t_map_odom_space")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     MAP_INDEX_FIELD_NUMBER: _ClassVar[int]
     T_MAP_ODOM_FIELD_NUMBER: _ClassVar[int]
     QUALITY_FIELD_NUMBER: _ClassVar[int]
+    T_MAP_ODOM_SPACE_FIELD_NUMBER: _ClassVar[int]
     version: int
     map_index: int
     t_map_odom: Pose
     quality: float
-    def __init__(self, version: _Optional[int] = ..., map_index: _Optional[int] = ..., t_map_odom: _Optional[_Union[Pose, _Mapping]] = ..., quality: _Optional[float] = ...) -> None: ...
+    t_map_odom_space: SpacePose
+    def __init__(self, version: _Optional[int] = ..., map_index: _Optional[int] = ..., t_map_odom: _Optional[_Union[Pose, _Mapping]] = ..., quality: _Optional[float] = ..., t_map_odom_space: _Optional[_Union[SpacePose, _Mapping]] = ...) -> None: ...
 
 class Acknowledgement(_message.Message):
     __slots__ = ("epoch", "sequence")

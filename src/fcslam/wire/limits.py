@@ -2,8 +2,9 @@
 
 from fcslam.records import Channel
 
-VERSION = 10
-"""The only version that is written and read; a change of the schema, a unit or a limit makes another one."""
+VERSION, SPACE_VERSION = 10, 11
+"""The versions that are written and read; a change of the schema, a unit or a limit makes another one. A packet has the
+second one if it holds a voxel map or a pose in space."""
 
 MAXIMUM_PACKET_BYTES = 96 * 1024
 """The largest packet, a place with the most keypoints, has 78 kB."""
@@ -21,6 +22,10 @@ MAXIMUM_KEYPOINTS = 2048
 KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}
 """Coordinates of a keypoint; a camera sees how high it is, too."""
 BYTES_PER_AXIS = 2
+
+BYTES_PER_POINT = 4
+MAXIMUM_ORIGINS = 256
+"""Positions of the scanner in a voxel map."""
 
 MAXIMUM_NETWORK_BYTES = 64 * 1024 * 1024
 """Largest file of a detector; present ones have 0.5 to 5 MB."""

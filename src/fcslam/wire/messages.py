@@ -14,6 +14,7 @@ from fcslam.records import (
     LaserModel,
     Place,
     TagSighting,
+    VoxelMap,
 )
 
 
@@ -26,6 +27,7 @@ class PacketKind(StrEnum):
     PLACE = "place"
     TAG_SIGHTING = "tag_sighting"
     KEYSCAN_FIX = "keyscan_fix"
+    VOXEL_MAP = "voxel_map"
     CORRECTION = "correction"
     ACKNOWLEDGEMENT = "acknowledgement"
     DETECTOR_UPDATE = "detector_update"
@@ -67,7 +69,18 @@ class DetectorUpdate:
     file: DetectorFile
 
 
-Body = Hello | Keyscan | Constraint | Place | TagSighting | KeyscanFix | Correction | Acknowledgement | DetectorUpdate
+Body = (
+    Hello
+    | Keyscan
+    | Constraint
+    | Place
+    | TagSighting
+    | KeyscanFix
+    | VoxelMap
+    | Correction
+    | Acknowledgement
+    | DetectorUpdate
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,12 +6,15 @@ from typing import Any, NamedTuple
 from google.protobuf.message import DecodeError
 
 from fcslam.errors import PacketError
-from fcslam.records import CODE_BYTES, Channel, Place
+from fcslam.geometry.voxels import MOST_POINTS
+from fcslam.records import CODE_BYTES, Channel, Place, VoxelMap
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire import limits
 from fcslam.wire.bodies import CODECS, KIND_OF_TYPE, read_channel, received
 from fcslam.wire.checks import check, check_name
-from fcslam.wire.messages import Packet, PacketKind
+from fcslam.wire.messages import Body, Packet, PacketKind
+
+_VERSIONS = limits.VERSION, limits.SPACE_VERSION
 
 
 class Label(NamedTuple):
@@ -30,7 +33,7 @@ def encode(packet: Packet) -> bytes:
     _, write, _ = CODECS[kind]
     body: dict[str, Any] = {kind: write(packet.body)}
     message = pb.Packet(
-        version=limits.VERSION,
+        version=_version_of(packet.body),
         robot=packet.robot,
         epoch=packet.epoch,
         sequence=packet.sequence,
@@ -69,8 +72,17 @@ def decode(data: bytes) -> Packet:
     _, _, read = CODECS[kind]
     body = read(getattr(message, kind), message)
     packet = Packet(message.robot, message.epoch, message.sequence, message.time, body)
+    if message.version != _version_of(body):
+        raise PacketError(f"a packet of version {_version_of(body)} says that it is of version {message.version}")
     check(packet)
     return packet
+
+
+def _version_of(body: Body) -> int:
+    """The lowest version that has what the record needs."""
+    pose = getattr(body, "T_i_j", getattr(body, "T_map_odom", None))
+    is_in_space = isinstance(body, VoxelMap) or (pose is not None and pose.shape == (7,))
+    return limits.SPACE_VERSION if is_in_space else limits.VERSION
 
 
 def readdress(data: bytes, epoch: int, sequence: int) -> bytes:
@@ -101,6 +113,8 @@ def unpacked_size(data: bytes) -> int:
     if kind is PacketKind.PLACE:
         each = limits.BYTES_PER_AXIS * max(limits.KEYPOINT_AXES.values()) + CODE_BYTES
         return len(data) + each * min(message.place.count, limits.MAXIMUM_KEYPOINTS)
+    if kind is PacketKind.VOXEL_MAP:
+        return len(data) + limits.BYTES_PER_POINT * min(message.voxel_map.count, MOST_POINTS)
     return len(data)
 
 
@@ -113,7 +127,7 @@ def read_number(data: bytes) -> tuple[str, int, int] | None:
     except (DecodeError, PacketError):
         return None
     numbered = message.epoch <= limits.MAXIMUM_EPOCH and message.sequence <= limits.MAXIMUM_SEQUENCE
-    known = message.version == limits.VERSION and numbered
+    known = message.version in _VERSIONS and numbered
     return (message.robot, message.epoch, message.sequence) if known else None
 
 
@@ -125,8 +139,9 @@ def _parse(data: bytes) -> tuple[pb.Packet, PacketKind]:
         message.ParseFromString(data)
     except DecodeError as error:
         raise PacketError("not a protobuf message of a packet") from error
-    if message.version != limits.VERSION:
-        raise PacketError(f"version {message.version} is unknown, this side speaks version {limits.VERSION}")
+    if message.version not in _VERSIONS:
+        known = " and ".join(map(str, _VERSIONS))
+        raise PacketError(f"version {message.version} is unknown, this side speaks versions {known}")
     message.DiscardUnknownFields()
     if message.ByteSize() != len(data):
         raise PacketError("unknown, repeated or overlong fields")

@@ -5,6 +5,7 @@ A robot maps with the ranges that it sends, ``rounded``, so that it and the clou
 
 from array import array
 from collections.abc import Sequence
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -23,7 +24,6 @@ MAXIMUM_KEYPOINT_M = 32767 * KEYPOINT_STEP_M
 
 _RANGE_OF_CODE = (RANGE_STEP_M * np.arange(65536)).astype(np.float32)
 _RANGE_OF_CODE[_NO_RETURN] = np.inf
-_MIRROR = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 
 
 def quantise(ranges_m: ArrayLike) -> RangeCodes:
@@ -93,11 +93,19 @@ def dequantise_keypoints(codes: KeypointCodes) -> NDArray[np.float32]:
 
 
 def pack_information(information: FloatArray) -> list[float]:
-    """Upper triangle xx, xy, xt, yy, yt, tt of a matrix (3, 3), rounded to float32 (infinite beyond its range)."""
-    xx, xy, xt, _, yy, yt, _, _, tt = information.ravel().tolist()
-    return array("f", (xx, xy, xt, yy, yt, tt)).tolist()
+    """Upper triangle xx, xy, xt, yy, yt, tt of a matrix (d, d), rounded to float32 (infinite beyond its range)."""
+    rows = information.tolist()
+    return array("f", [number for k, row in enumerate(rows) for number in row[k:]]).tolist()
 
 
 def unpack_information(upper: Sequence[float]) -> FloatArray:
-    """The symmetric matrix (3, 3) of an upper triangle."""
-    return frozen(np.array(upper)[_MIRROR].reshape(3, 3))
+    """The symmetric matrix (d, d) of an upper triangle of 6 or 21 numbers."""
+    return frozen(np.array(upper)[_mirror(3 if len(upper) == 6 else 6)])
+
+
+@cache
+def _mirror(freedom: int) -> NDArray[np.int64]:
+    places = np.zeros((freedom, freedom), np.int64)
+    row, column = np.triu_indices(freedom)
+    places[row, column] = places[column, row] = np.arange(len(row))
+    return places

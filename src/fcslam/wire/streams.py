@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import PacketError
-from fcslam.records import CODE_BYTES, Codes
-from fcslam.wire.limits import BYTES_PER_AXIS, BYTES_PER_RANGE
+from fcslam.geometry.voxels import LOWEST, VOXEL_STEPS, voxel_keys
+from fcslam.records import CODE_BYTES, Codes, Steps
+from fcslam.wire.limits import BYTES_PER_AXIS, BYTES_PER_POINT, BYTES_PER_RANGE
 
 RangeCodes = NDArray[np.uint16]
 KeypointCodes = NDArray[np.int16]
@@ -87,6 +88,27 @@ def unpack_descriptors(data: bytes, count: int) -> Codes:
     for bit in range(1, _BITS):
         bits[bit] ^= bits[like[bit]] ^ opposite[bit]
     return np.packbits(bits.T, axis=1)
+
+
+def pack_points(points: Steps) -> bytes:
+    """Encode the points (N, 3) of a voxel map, by voxels in ascending order: differences of voxels, places in them."""
+    steps = np.diff(voxel_keys(points), prepend=0).astype("<u4").view(np.uint8).reshape(-1, 4)[:, :3]
+    place = (points % VOXEL_STEPS) @ (VOXEL_STEPS**2, VOXEL_STEPS, 1)
+    return _deflate(steps.T.tobytes() + place.astype(np.uint8).tobytes())
+
+
+def unpack_points(data: bytes, count: int) -> Steps:
+    """Inverse of ``pack_points``: ``count`` points, shape (count, 3)."""
+    plain = _inflate(data, BYTES_PER_POINT * count, "voxel map: points")
+    planes = np.frombuffer(plain, np.uint8).reshape(BYTES_PER_POINT, count)
+    steps = planes[:3].astype(np.int64)
+    keys = np.cumsum(steps[0] | steps[1] << 8 | steps[2] << 16)
+    place = planes[3].astype(np.int64)
+    if keys.max(initial=0) >= 1 << 24 or place.max(initial=0) >= VOXEL_STEPS**3:
+        raise PacketError("voxel map: a point is outside its bounds")
+    voxels = np.stack((keys >> 16, keys >> 8 & 255, keys & 255), axis=1) + LOWEST
+    within = np.stack((place // VOXEL_STEPS**2, place // VOXEL_STEPS % VOXEL_STEPS, place % VOXEL_STEPS), axis=1)
+    return np.asarray(VOXEL_STEPS * voxels + within, np.int16)
 
 
 def _high_and_low(numbers: NDArray[np.uint16]) -> bytes:

@@ -1,0 +1,45 @@
+"""Voxels of voxel maps: one point in each, in steps, within fixed bounds. All maps of a fleet use the same."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.records import STEP_M, Steps
+
+VOXEL_STEPS: Final = 5
+"""Side of a voxel in steps: 0.1 m."""
+LOWEST, END = (-128, -128, -64), (128, 128, 192)
+"""The lowest voxel and the end of the highest one: 12.8 m around, from 6.4 m below to 19.2 m above."""
+MOST_POINTS: Final = 32768
+
+
+def are_inside(steps: NDArray[np.int64] | Steps) -> bool:
+    """Whether points (N, 3) are within the bounds."""
+    low, high = (VOXEL_STEPS * np.array(corner) for corner in (LOWEST, END))
+    return bool(((steps >= low) & (steps < high)).all())
+
+
+def voxel_keys(points: NDArray[np.int64] | Steps) -> NDArray[np.int64]:
+    """Number of the voxel of each point (N, 3), shape (N,): ascending by x, then y, then z; below 2^24."""
+    keys: NDArray[np.int64] = (points.astype(np.int64) // VOXEL_STEPS - LOWEST) @ (1 << 16, 1 << 8, 1)
+    return keys
+
+
+def voxelised(points_m: NDArray[np.float64]) -> Steps:
+    """The middle of the points (N, 3), metres, in each voxel; voxels in ascending order, without those outside.
+
+    Of more than ``MOST_POINTS`` voxels the nearest ones are kept.
+    """
+    low, high = (VOXEL_STEPS * STEP_M * np.array(corner) for corner in (LOWEST, END))
+    inside = points_m[((points_m >= low) & (points_m < high)).all(axis=1)]
+    voxels = np.floor(inside / (VOXEL_STEPS * STEP_M)).astype(np.int64)
+    unique, number, counts = np.unique(voxel_keys(VOXEL_STEPS * voxels), return_inverse=True, return_counts=True)
+    middle = np.column_stack([np.bincount(number, axis) for axis in inside.T]) / counts[:, None]
+    first = np.zeros((len(unique), 3), np.int64)
+    first[number] = VOXEL_STEPS * voxels  # a middle that rounds into the next voxel stays in its own
+    steps = np.clip(np.rint(middle / STEP_M).astype(np.int64), first, first + VOXEL_STEPS - 1)
+    if len(steps) > MOST_POINTS:
+        nearest = np.argsort((steps**2).sum(axis=1), kind="stable")[:MOST_POINTS]
+        steps = steps[np.sort(nearest)]
+    return steps.astype(np.int16)
