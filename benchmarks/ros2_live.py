@@ -121,7 +121,7 @@ def heard_transforms(environment):
         heard_transforms.arrivals = []
         heard_transforms.network.subscribe(
             "/tf", "tf2_msgs/TFMessage", Quality(True, False, 100),
-            lambda _: heard_transforms.arrivals.append(time.monotonic()),
+            lambda *_: heard_transforms.arrivals.append(time.monotonic()),
         )  # fmt: skip
     heard_transforms.arrivals.clear()
     return heard_transforms.arrivals

@@ -31,10 +31,10 @@ class MemoryNetwork:
     def close(self):
         pass
 
-    def say(self, topic, kind, message):
+    def say(self, topic, kind, message, publisher=""):
         """Publish as somebody else."""
         for deliver in self._subscribers[topic]:
-            deliver(self._codec.encode(message, kind))
+            deliver(self._codec.encode(message, kind), publisher)
 
 
 def offered(topic, kind, reliable=True, latched=False):

@@ -3,11 +3,12 @@
 import sys
 import threading
 
+import numpy as np
 import pytest
 
 from fcslam.cli import main
 from fcslam.errors import InputError
-from fcslam.ros.inbox import Inbox
+from fcslam.ros.inbox import SILENCE_S, Inbox
 from fcslam.ros.node import await_sensors
 from fcslam.ros.record import record
 from fcslam.ros.ros2 import INSTALL, Ros2Network
@@ -74,7 +75,7 @@ def test_a_full_disk_keeps_what_was_recorded_before(tmp_path):
 
 def test_messages_that_the_reader_cannot_take_are_counted():
     network, losses = MemoryNetwork(), []
-    inbox = Inbox(2 * len(encoded(SCAN, scan(1.0, RANGES))), lambda: losses.append(1))
+    inbox = Inbox(2 * len(encoded(SCAN, scan(1.0, RANGES))), losses.append)
     inbox.subscribe(network, {"/scan": SCAN}, {}, iter(range(9)).__next__)
     for stamp in range(4):
         network.say("/scan", SCAN, scan(stamp, RANGES))
@@ -83,6 +84,27 @@ def test_messages_that_the_reader_cannot_take_are_counted():
     network.say("/scan", SCAN, scan(4.0, RANGES))
     assert [inbox.get(0.0).received_ns for _ in range(2)] == [1, 2]
     assert (inbox.lost, inbox.get(0.0)) == (2, None)
+
+
+@pytest.mark.attack
+def test_a_second_publisher_is_named_once_and_counts_when_the_first_is_silent():
+    network, lines, now = MemoryNetwork(), [], [0.0]
+    inbox = Inbox(notify=lines.append, clock=lambda: now[0])
+    inbox.subscribe(network, {"/scan": SCAN, "/tf": TRANSFORMS}, {}, lambda: 0)
+
+    def taken(topic, kind, message, publisher):
+        network.say(topic, kind, message, publisher)
+        return inbox.get(0.0) is not None
+
+    for now[0] in np.arange(0.0, 5.0, 0.1):
+        assert taken("/scan", SCAN, scan(now[0], RANGES), "driver")
+        assert not taken("/scan", SCAN, scan(now[0], RANGES), f"stranger {now[0]:.1f}")
+        assert taken("/tf", TRANSFORMS, transform(now[0], "odom", "base_link"), f"node {now[0]:.1f}")
+    (line,) = lines
+    assert line.startswith("/scan has two publishers, driver and stranger 0.0; the messages of the second one are left")
+    now[0] += SILENCE_S + 0.1
+    assert taken("/scan", SCAN, scan(now[0], RANGES), "driver, started again")
+    assert not taken("/scan", SCAN, scan(now[0], RANGES), "driver")
 
 
 def test_a_missing_middleware_is_told_with_the_command_that_installs_it(monkeypatch):

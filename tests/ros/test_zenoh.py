@@ -64,7 +64,7 @@ def test_endpoints_are_seen_until_they_go(network, peer):
 def test_messages_arrive_in_both_directions(network, peer):
     came, went = [], []
     sent = encoded(SCAN, scan(1.0, np.ones(90)))
-    network.subscribe("/robot1/scan", SCAN, Quality(reliable=False), came.append)
+    network.subscribe("/robot1/scan", SCAN, Quality(reliable=False), lambda payload, _: came.append(payload))
     publish = network.publisher("/robot1/text", STRING, Quality(reliable=True))
     peer.subscribe("/robot1/text", STRING, zenoh_peer.RELIABLE, went.append)
     put = peer.publisher("/robot1/scan", SCAN, zenoh_peer.BEST_EFFORT)
@@ -79,7 +79,7 @@ def test_what_is_latched_reaches_who_comes_late(network, peer):
     static = encoded(TRANSFORMS, transform(0.0, "base_link", "laser"))
     peer.publisher("/tf_static", TRANSFORMS, zenoh_peer.LATCHED)(static)
     peer.subscribe("/robot1/text", STRING, zenoh_peer.LATCHED, went.append)
-    network.subscribe("/tf_static", TRANSFORMS, Quality(True, latched=True), came.append)
+    network.subscribe("/tf_static", TRANSFORMS, Quality(True, latched=True), lambda payload, _: came.append(payload))
     wait_for(lambda: came and went)
     assert came == [static]
     assert went == [HELLO]
@@ -88,7 +88,7 @@ def test_what_is_latched_reaches_who_comes_late(network, peer):
 def test_own_messages_do_not_come_back(network, peer):
     heard, came = threading.Event(), []
     peer.subscribe("/text", STRING, zenoh_peer.RELIABLE, lambda _: heard.set())
-    network.subscribe("/text", STRING, Quality(True), came.append)
+    network.subscribe("/text", STRING, Quality(True), lambda payload, _: came.append(payload))
     publish = network.publisher("/text", STRING, Quality(True))
     put = peer.publisher("/text", STRING, zenoh_peer.RELIABLE)
     wait_for(lambda: publish(HELLO) or heard.is_set())

@@ -9,8 +9,8 @@ from typing import NamedTuple, Protocol
 MOST_ENDPOINTS = 10_000
 """Most endpoints of a network that are remembered."""
 
-Deliver = Callable[[bytes], object]
-"""Called with the bytes of each message, in a thread of the network."""
+Deliver = Callable[[bytes, str], object]
+"""Called with the bytes of each message and the id of its publisher, in a thread of the network."""
 Publish = Callable[[bytes], None]
 """Sends the bytes of one message. Any thread may call it."""
 

@@ -8,6 +8,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ from fcslam.errors import FcslamError, InputError
 from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
 from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock, TransformStream
-from fcslam.ros.inbox import POLL_S, Inbox
+from fcslam.ros.inbox import POLL_S, SILENCE_S, Inbox
 from fcslam.ros.live_plan import Notify
 from fcslam.ros.network import Endpoint, Quality, RosNetwork
 from fcslam.ros.outputs import MAP, OWN_MAP, POSE, Outputs, nanoseconds
@@ -40,13 +41,11 @@ STRING, EMPTY = "std_msgs/String", "std_msgs/Empty"
 SAVE_MAP, FINISH, FLOOR, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "fcslam/floor", "initialpose"
 _NAMES_WAITING = 8
 """Most maps that wait to be saved; anybody on the network may ask for them."""
-_LINES_TOLD = 1000
+_LINES_TOLD = 100
 """Largest number of different lines that are printed; the names in some come from the network."""
 _FLEET_PERIOD_S = 0.2
 """Time between two messages with the poses of the fleet."""
 _SETTLES_FOR_ODOMETRY = 4
-_SILENCE_S = 2.0
-"""A longer pause of the scans is reported."""
 _DEPTHS = {**dict.fromkeys((*SCANS, COMPRESSED_IMAGE, IMAGE), 10), **dict.fromkeys(LASER_SCANS, 100), CAMERA_INFO: 1}
 
 
@@ -95,9 +94,7 @@ class RobotNode:
         self._robot, self._parameters, self._notify = robot, parameters, notify
         self._suggest_pose, self._change_floor = suggest_pose, change_floor
         self._codec = MessageCodec(ros1=False)
-        self._inbox = Inbox(
-            report_loss=lambda: self._tell_once("messages come faster than this computer can map; some are lost")
-        )
+        self._inbox = Inbox(notify=self._tell_once)
         self._names: queue.Queue[str] = queue.Queue(_NAMES_WAITING)
         """Of the files of maps to be saved."""
         self._stop = threading.Event()
@@ -148,8 +145,8 @@ class RobotNode:
                     if is_silent:
                         self._notify(f"scans arrive again after {now_s - heard_s:.0f} s")
                     heard_s, is_silent = now_s, False
-                elif not is_silent and now_s > heard_s + _SILENCE_S and before:
-                    self._notify(f"no scan for {_SILENCE_S:.0f} s; the robot waits for the network or the driver")
+                elif not is_silent and now_s > heard_s + SILENCE_S and before:
+                    self._notify(f"no scan for {SILENCE_S:.0f} s; the robot waits for the network or the driver")
                     is_silent = True
                 if not self._clock.is_running and now_s > began_s + self._parameters.topic_timeout:
                     self._tell_once(
@@ -289,27 +286,32 @@ class RobotNode:
 
     def _subscribe(self) -> None:
         self._inbox.subscribe(self._network, self._topics.kinds, _DEPTHS, self._clock.now_ns)
-        commands: list[tuple[str, str, Callable[[bytes], object]]] = [
-            (SAVE_MAP, STRING, self._take_name),
-            (FINISH, EMPTY, lambda _: self.stop()),
-            (INITIAL_POSE, POSE, self._take_pose),
-            (FLOOR, STRING, self._take_floor),
+        commands: list[tuple[str, str, Callable[[bytes], object], str]] = [
+            (SAVE_MAP, STRING, self._take_name, "the map cannot be saved"),
+            (FINISH, EMPTY, lambda _: self.stop(), ""),
+            (INITIAL_POSE, POSE, self._take_pose, "an initial pose is refused"),
+            (FLOOR, STRING, self._take_floor, "a floor is refused"),
         ]
-        for name, kind, command in commands:
-            self._network.subscribe(resolved(self._namespace, name), kind, Quality(reliable=True), command)
+        for name, kind, command, refusal in commands:
+            take = partial(self._take, command, refusal)
+            self._network.subscribe(resolved(self._namespace, name), kind, Quality(reliable=True), take)
         if self._clock.simulated:
             self._network.subscribe(
-                CLOCK_TOPIC, CLOCK, Quality(reliable=False), lambda payload: self._clock.tick(payload, self._codec)
+                CLOCK_TOPIC, CLOCK, Quality(reliable=False), lambda payload, _: self._clock.tick(payload, self._codec)
             )
 
-    def _take_name(self, payload: bytes) -> None:
+    def _take(self, command: Callable[[bytes], object], refusal: str, payload: bytes, _publisher: str) -> None:
+        """Do what a message asks for. Anybody on the network may send many, so each topic has one line of refusal."""
         try:
-            name = self._codec.decode(payload, STRING).data or self._robot.name
-            if not NAME.fullmatch(name):  # anybody on the network may send it
-                raise ValueError(f"{name!r} is not a name; give letters, digits and . _ -, without a folder")
-            self._names.put_nowait(name)
-        except (ValueError, queue.Full) as error:
-            self._notify(f"the map cannot be saved: {error or 'too many wait'}")
+            command(payload)
+        except (ValueError, FcslamError, queue.Full) as error:
+            self._tell_once(f"{refusal}: {one_line(str(error)) or 'too many wait'}", refusal)
+
+    def _take_name(self, payload: bytes) -> None:
+        name = self._codec.decode(payload, STRING).data or self._robot.name
+        if not NAME.fullmatch(name):
+            raise ValueError(f"{name!r} is not a name; give letters, digits and . _ -, without a folder")
+        self._names.put_nowait(name)
 
     def _save_maps(self) -> None:
         """Write the files of map_server to this process's folder."""
@@ -329,28 +331,22 @@ class RobotNode:
         if self._suggest_pose is None:
             self._tell_once("an initial pose is ignored: the robot maps, and its first scan is the origin of the map")
             return
-        try:
-            message = self._codec.decode(payload, POSE)
-            frame = message.header.frame_id.lstrip("/")
-            if frame != self._parameters.map_frame:
-                raise ValueError(f"it is in frame {one_line(repr(frame))}; give it in {self._parameters.map_frame!r}")
-            at, turn = message.pose.pose.position, message.pose.pose.orientation
-            x, y, theta = planar(transform_of((at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w)))
-            self._suggest_pose(np.array((x, y, theta)))
-        except (ValueError, FcslamError) as error:  # anybody on the network may send it
-            self._notify(f"an initial pose is refused: {error}")
-            return
-        self._notify(f"initial pose ({x:.2f} m, {y:.2f} m, {theta:.2f} rad): it counts once the walls confirm it")
+        message = self._codec.decode(payload, POSE)
+        frame = message.header.frame_id.lstrip("/")
+        if frame != self._parameters.map_frame:
+            raise ValueError(f"it is in frame {one_line(repr(frame))}; give it in {self._parameters.map_frame!r}")
+        at, turn = message.pose.pose.position, message.pose.pose.orientation
+        x, y, theta = planar(transform_of((at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w)))
+        self._suggest_pose(np.array((x, y, theta)))
+        line = f"initial pose ({x:.2f} m, {y:.2f} m, {theta:.2f} rad): it counts once the walls confirm it"
+        self._tell_once(line, "initial pose")
 
     def _take_floor(self, payload: bytes) -> None:
         """Begin a session on another floor, as a lift's controller says."""
         if self._change_floor is None:
             self._tell_once("a floor is ignored: the robot localizes in one finished map")
             return
-        try:
-            self._change_floor(self._codec.decode(payload, STRING).data)
-        except (ValueError, FcslamError) as error:  # anybody on the network may send it
-            self._tell_once(f"a floor is refused: {one_line(str(error))}")
+        self._change_floor(self._codec.decode(payload, STRING).data)
 
     def _has_namesake(self, endpoints: Sequence[Endpoint]) -> bool:
         return any(point.publishes and not point.own and point.topic == self._map_topic for point in endpoints)
@@ -360,7 +356,9 @@ class RobotNode:
         if self._has_namesake(self._network.endpoints()):
             self._tell_once(f"another node publishes {self._map_topic} now, too; give each robot a name of its own")
 
-    def _tell_once(self, line: str) -> None:
-        if line and line not in self._told and len(self._told) < _LINES_TOLD:
-            self._told.add(line)
+    def _tell_once(self, line: str, about: str = "") -> None:
+        """Tell the first line about something; by default about what it says itself."""
+        about = about or line
+        if line and about not in self._told and len(self._told) < _LINES_TOLD:
+            self._told.add(about)
             self._notify(line)

@@ -61,6 +61,7 @@ class Ros2Network:
         self._known: dict[str, Endpoint] = {}
         self._readers: tuple[tuple[Any, Deliver], ...] = ()
         self._topics: dict[tuple[str, str], Any] = {}
+        self._publishers: dict[int, str] = {}
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._receive, name="dds", daemon=True)
         self._thread.start()
@@ -120,6 +121,16 @@ class Ros2Network:
             self._topics[name, kind] = Topic(self._participant, f"rt{name}", raw_type(dds_type(kind)))
         return self._topics[name, kind]
 
+    def _publisher_of(self, reader: Any, sample: Any) -> str:
+        """The id of a publisher in the whole network; that of this process if it has gone."""
+        handle = sample.sample_info.publication_handle
+        if handle not in self._publishers:
+            found = reader.get_matched_publication_data(handle)
+            if found is None:
+                return str(handle)
+            self._publishers[handle] = str(found.key)
+        return self._publishers[handle]
+
     def _receive(self) -> None:
         while not self._closed.is_set():
             self._waitset.wait(_WAIT_NS)
@@ -128,7 +139,7 @@ class Ros2Network:
                     payload = getattr(sample, "payload", None)  # None: the publisher has gone
                     if payload is not None:
                         try:
-                            deliver(payload)
+                            deliver(payload, self._publisher_of(reader, sample))
                         except Exception:  # this thread receives everything, so it must not end
                             _log.exception("a message cannot be taken; the next ones are")
 

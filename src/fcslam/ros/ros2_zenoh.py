@@ -76,7 +76,8 @@ class ZenohNetwork:
 
         def take(sample: Any) -> None:
             if sample.kind == self._zenoh.SampleKind.PUT:
-                deliver(sample.payload.to_bytes())
+                sender = sample.attachment.to_bytes()[-16:].hex() if sample.attachment else ""
+                deliver(sample.payload.to_bytes(), sender)
 
         key = f"{self._domain}/{topic.strip('/')}/{dds_type(kind)}/*"
         remote = self._zenoh.Locality.REMOTE

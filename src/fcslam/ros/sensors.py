@@ -90,6 +90,8 @@ class LiveSensors:
         self._directions: dict[str, int] = {}
         """Directions of the scans of clouds in a full turn, by topic; the first cloud decides."""
         self._frames: dict[str, str] = {}
+        self._mixed: set[str] = set()
+        """Topics with scans of other frames, of which there was a line."""
         self._plan: LivePlan | None = None
         """How the robot is read, once that is known."""
         self._reader: SensorReader | None = None
@@ -201,10 +203,12 @@ class LiveSensors:
             return []
         scan = scan._replace(laser=laser)
         if scan.frame != self._frames.setdefault(topic, scan.frame):
-            self._notify(
-                f"{topic} has scans of the frames '{self._frames[topic]}' and '{scan.frame}', the last are left "
-                "out; publish the scans of each laser on a topic of its own"
-            )
+            if topic not in self._mixed:
+                self._mixed.add(topic)
+                self._notify(
+                    f"{topic} has scans of the frames '{self._frames[topic]}' and '{scan.frame}', the last are left "
+                    "out; publish the scans of each laser on a topic of its own"
+                )
             self.audit.add(Fault.OTHER_BEAMS, self._counts[topic])
             return []
         if self._plan is None:
@@ -260,10 +264,11 @@ class LiveSensors:
         self._misplaced += 1
         if self._misplaced < STEPS_BACK_FOR_RESTART:
             return False
-        self._notify(
-            f"the clock of the scans stepped back by {newest - stamp:.1f} s, as when a bag is played again; "
-            "the robot goes on from there"
-        )
+        if not self.restarts:
+            self._notify(
+                f"the clock of the scans stepped back by {newest - stamp:.1f} s, as when a bag is played again; "
+                "the robot goes on from there"
+            )
         self.restarts += 1
         self._misplaced, self._newest_stamp = 0, stamp
         return True
