@@ -176,16 +176,18 @@ def test_a_body_that_is_wider_than_usual_is_left_out_with_a_note(tmp_path, colum
     assert min(np.nanmin(each.ranges_m) for each in scans_of(source)) > 0.75
 
 
-def test_depth_images_are_scans(tmp_path):
-    mounting = tf(START, "base_link", "depth_optical_frame", (0.0, 0.0, 0.3), OPTICAL_XYZW, topic="/tf_static")
+@pytest.mark.parametrize(("frame", "xyzw"), [("optical_frame", OPTICAL_XYZW), ("camera_link", quaternion())])
+def test_depth_images_are_scans(tmp_path, frame, xyzw):
+    mounting = tf(START, "base_link", frame, (0.0, 0.0, 0.3), xyzw, topic="/tf_static")
     messages = [mounting, *(odom(START + t, (0.0, 0.0, 0.0), bag_time=START + t) for t in np.arange(0.0, 1.5, 0.1))]
     image, info = depth_image(START, "16UC1")
     for t in np.arange(0.2, 1.0, 0.1):
-        image.header = info.header = header(ROS2, START + t, "depth_optical_frame")
+        image.header = info.header = header(ROS2, START + t, frame)
         messages.append(said("/camera/depth/image_rect_raw", START + t, image, IMAGE))
         messages.append(said("/camera/depth/camera_info", START + t, info, INFO))
     found = inspect(save(tmp_path / "depth.mcap", messages))
     assert found.problem is None
+    assert any("looks up, so 'camera_link' is not" in note for note in found.notes) == (frame == "camera_link")
     assert (found.scans, found.camera) == (8, None)
     record, *_ = scans_of(open_source(tmp_path / "depth.mcap"))
     beams, heading = record.laser.beams, record.laser.T_base_laser[2]

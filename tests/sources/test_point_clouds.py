@@ -114,6 +114,29 @@ def test_the_body_is_measured_whichever_direction_a_scan_begins_with(directions)
     assert sample.radius_m((0.3, 0.0, 0.0)) == pytest.approx(0.7)
 
 
+@pytest.mark.parametrize("wrong_s", [60.0, 4.2, 0.5, -1.0, math.nan])
+def test_points_with_wrong_times_are_left_out(wrong_s):
+    measured = spinning(at_rest, first_rad=0.7)
+    lost = np.random.default_rng(1).random(len(measured.times)) < 0.1
+    message = cloud(STAMP, Measured(measured.points, np.where(lost, wrong_s, measured.times)), VELODYNE)
+    assert cloud_of(message, POINT_CLOUD, 0).left_out == np.count_nonzero(lost)
+    scan = read(message)
+    assert_room(scan)
+    assert_turn(scan)
+
+
+def test_times_that_are_shares_of_a_turn_are_the_order_of_the_points():
+    measured = spinning(at_rest, first_rad=0.7)
+    order = np.random.default_rng(1).permutation(len(measured.times))
+    mixed = Measured(measured.points[order], measured.times[order] / PERIOD_S)
+    found = cloud_of(cloud(STAMP, mixed, VELODYNE), POINT_CLOUD, 0, longest_s=1.2 * PERIOD_S)
+    assert found.is_in_order
+    assert not len(found.times_s)
+    scan = scan_of_cloud(found, mounting(), BAND)
+    assert_room(scan)
+    assert abs(math.remainder(scan.beams.angle_min_rad - 0.7, math.tau)) < 2.0 * math.tau / DIRECTIONS
+
+
 def test_points_in_no_order_are_seen_at_their_mean_time():
     scan = read(cloud(STAMP, scattered(at_rest), LIVOX))
     assert scan.stamp == pytest.approx(STAMP + PERIOD_S / 2, abs=1e-3)
@@ -200,10 +223,10 @@ def test_a_robot_that_tilts_does_not_see_the_floor(roll, pitch):
 
 def test_the_floor_shows_the_height_of_a_sensor_that_tf_lacks():
     message = cloud(STAMP, spinning(at_rest, (0.1, 0.2, 0.55), rotation(yaw=0.3)), VELODYNE)
-    assert_room(read(message, given_cloud_mounting((0.1, 0.2, 0.3), "lidar")), heading=0.3, x=0.1, y=0.2)
+    assert_room(read(message, given_cloud_mounting((0.1, 0.2, 0.3), POINT_CLOUD, "lidar")), heading=0.3, x=0.1, y=0.2)
     above = cloud(STAMP, Measured(*(each[measured_above(message)] for each in spinning(at_rest))), VELODYNE)
     with pytest.raises(ValueError, match="no floor is seen"):
-        read(above, given_cloud_mounting((0.0, 0.0, 0.0), "lidar"))
+        read(above, given_cloud_mounting((0.0, 0.0, 0.0), POINT_CLOUD, "lidar"))
 
 
 def measured_above(message):

@@ -225,10 +225,12 @@ class LiveSensors:
             return None
         cloud = cloud_of(content, kind, received_ns, self.planner.calibrations.get(info))
         if self._options.laser_poses:
-            mounting = given_cloud_mounting(self._options.laser_poses[self._topics.scans.index(topic)], cloud.frame)
+            pose = self._options.laser_poses[self._topics.scans.index(topic)]
+            mounting = given_cloud_mounting(pose, kind, cloud.frame)
         else:
             try:
-                mounting = cloud_mounting(self.planner.tree.fixed(self.planner.known_base_frame, cloud.frame))
+                T_base_sensor = self.planner.tree.fixed(self.planner.known_base_frame, cloud.frame)
+                mounting = cloud_mounting(T_base_sensor, kind, cloud.frame)
             except NoTransformError as error:
                 self.planner.awaited[topic] = missing_mounting(error)
                 return None

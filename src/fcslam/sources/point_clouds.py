@@ -98,6 +98,10 @@ class PointCloud(NamedTuple):
     """Shape (N, 3), metres, finite, in the frame of the sensor."""
     times_s: FloatArray
     """Shape (N,): time of each return after the stamp; shape (0,): not known."""
+    left_out: int = 0
+    """Returns that were left out, as their times are wrong."""
+    is_in_order: bool = False
+    """Whether the times, in no known unit, gave the order of the returns."""
 
 
 class CloudMounting(NamedTuple):

@@ -8,10 +8,10 @@ from typing import TypeVar
 from fcslam.errors import SourceError
 from fcslam.sources.bags.camera import Calibration, calibration_of
 from fcslam.sources.bags.census import BagMessage
-from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting
-from fcslam.sources.bags.codec import IMAGE, LASER_SCANS
+from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting, lacks_optical_frame
+from fcslam.sources.bags.codec import IMAGE, LASER_SCANS, NANOSECONDS, SCANS
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.messages import ScanMessage
+from fcslam.sources.bags.messages import LONGEST_SWEEP_S, ScanMessage
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.topics import calibration_beside
@@ -21,6 +21,8 @@ from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud, di
 
 _CLOUDS_TRIED = 10 * FIRST_MESSAGES
 """First clouds over which those are spread that show the floor and the directions of the sensor."""
+_OVER_INTERVAL = 1.2
+"""Largest ratio of the duration of a cloud to the mean time between two clouds."""
 
 Found = TypeVar("Found")
 
@@ -72,9 +74,10 @@ class BagScans:
             return scan
         cloud = self._cloud(message)
         if (topic, cloud.frame) not in self._mountings:
-            mounting = self._levelled(topic, cloud.frame, self._mounting(topic, cloud.frame))
-            directions = directions_in(self._some_clouds(topic, cloud.frame), mounting)
-            self._mountings[topic, cloud.frame] = mounting._replace(directions=directions)
+            clouds = list(self._some_clouds(topic, cloud.frame))
+            mounting = self._levelled(topic, clouds, self._mounting(topic, cloud.frame))
+            self._mountings[topic, cloud.frame] = mounting._replace(directions=directions_in(clouds, mounting))
+            self.notes += [f"{self._robot.bag.path}: {note}" for note in _notes_on_times(topic, clouds)]
         return scan_of_cloud(cloud, self._mountings[topic, cloud.frame], band)
 
     def _cloud(self, message: BagMessage) -> PointCloud:
@@ -82,14 +85,18 @@ class BagScans:
         if topic not in self._calibrations:
             info = calibration_beside(topic, self._robot.topics) if topic.type == IMAGE else None
             self._calibrations[topic] = calibration_in(self._robot, info)
-        return cloud_of(message.content, topic.type, message.bag_time_ns, self._calibrations[topic])
+        its = self._robot.bag.census[topic]
+        first_ns, last_ns = its.span_ns
+        interval_s = len(its.frames) * (last_ns - first_ns) / (max(1, its.count - 1) * NANOSECONDS)
+        longest_s = min(_OVER_INTERVAL * interval_s, LONGEST_SWEEP_S) or LONGEST_SWEEP_S
+        return cloud_of(message.content, topic.type, message.bag_time_ns, self._calibrations[topic], longest_s)
 
     def _mounting(self, topic: Topic, frame: str) -> CloudMounting:
         path = self._robot.bag.path
         if self._options.laser_poses:
-            return given_cloud_mounting(self._options.laser_poses[self._scans.index(topic)], frame)
+            return given_cloud_mounting(self._options.laser_poses[self._scans.index(topic)], topic.type, frame)
         try:
-            return cloud_mounting(self._tree.fixed(self._base_frame_of(frame), frame))
+            T_base_sensor = self._tree.fixed(self._base_frame_of(frame), frame)
         except NoTransformError as error:
             if is_fixed(frame):
                 raise SourceError(
@@ -101,14 +108,20 @@ class BagScans:
                 f"{path}: tf has {error}, so the pose of the sensor of {topic.name} is unknown; give it "
                 "with --sensors laser-pose=X,Y,THETA (metres, radians)"
             ) from error
+        if lacks_optical_frame(T_base_sensor, topic.type, frame):
+            self.notes.append(
+                f"{path}: by tf, the camera of {topic.name} looks up, so '{frame}' is not its optical frame; "
+                "corrected: publish a frame with roll -90 and yaw -90 deg in it, and name that in the images"
+            )
+        return cloud_mounting(T_base_sensor, topic.type, frame)
 
-    def _levelled(self, topic: Topic, frame: str, mounting: CloudMounting) -> CloudMounting:
-        found = leaning(self._some_clouds(topic, frame), mounting)
+    def _levelled(self, topic: Topic, clouds: list[PointCloud], mounting: CloudMounting) -> CloudMounting:
+        found = leaning(clouds, mounting)
         if found is None:
             return mounting
         self.notes.append(
             f"{self._robot.bag.path}: the floor in {topic.name} leans by {degrees(acos(found[2, 2])):.0f} deg against "
-            f"the mounting of '{frame}'; corrected: correct it in tf"
+            f"the mounting of '{clouds[0].frame}'; corrected: correct it in tf"
         )
         return mounting._replace(rotation=found @ mounting.rotation)
 
@@ -116,3 +129,17 @@ class BagScans:
         step = max(1, min(topic.message_count, _CLOUDS_TRIED) // FIRST_MESSAGES)
         clouds = valid(islice(self._robot.bag.read([topic]), 0, _CLOUDS_TRIED, step), self._cloud)
         return (cloud for cloud in clouds if cloud.frame == frame)
+
+
+def _notes_on_times(topic: Topic, clouds: list[PointCloud]) -> Iterator[str]:
+    left_out = sum(cloud.left_out for cloud in clouds)
+    if left_out:
+        share = left_out / (left_out + sum(len(cloud.points) for cloud in clouds))
+        yield f"{share:.1%} of the points of {topic.name} are left out, as their times are far from those of the others"
+    if topic.type in SCANS and not any(len(cloud.times_s) for cloud in clouds):
+        is_in_order = any(cloud.is_in_order for cloud in clouds)
+        times = "times that are no seconds and count as their order" if is_in_order else "no times, or all the same"
+        yield (
+            f"the points of {topic.name} have {times}, so the motion of the robot during a cloud is corrected only if "
+            "the drive shows how the sensor turns; let the driver publish them"
+        )

@@ -20,32 +20,53 @@ _TIMES: Final = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_of
 _UNITS_S: Final = (1.0, 1e-3, 1e-6, 1e-9)
 _SHORTEST_CLOUD_S: Final = 5e-3
 """Least time between the first and the last point of a cloud; it shows the unit of the times."""
+_BULK: Final = 0.5
+"""Share of the points of a cloud, in the middle of all times, that show the unit."""
+_REACH: Final = 4.0
+"""Times that are farther from those of the bulk than this many times its duration are wrong, as of lost packets."""
 _NEAR_STAMP_S: Final = 1.5
 """Times that begin this near to the stamp, or to 0, are by its clock, or after it."""
 _DEPTHS: Final = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
 """Type and unit of the pixels of a depth image, by its encoding."""
 _OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation of the optical frame of a camera that looks along x (REP 103)."""
+_UP: Final = 0.7
+"""Height of the optical axis of a camera that looks up, per metre."""
 
 
-def cloud_mounting(T_base_sensor: Transform) -> CloudMounting:
-    """The mounting that tf has."""
+def cloud_mounting(T_base_sensor: Transform, kind: str, frame: str) -> CloudMounting:
+    """The mounting that tf has, of a sensor with messages of type ``kind`` in ``frame``."""
     columns = [rotated(T_base_sensor.rotation, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
+    axes = _OPTICAL if lacks_optical_frame(T_base_sensor, kind, frame) else np.eye(3)
     heading_rad = planar(T_base_sensor)[2]
-    return CloudMounting(np.array(columns).T, np.array(T_base_sensor.translation_m), heading_rad)
+    return CloudMounting(np.array(columns).T @ axes, np.array(T_base_sensor.translation_m), heading_rad)
 
 
-def given_cloud_mounting(pose: GivenPose, frame: str) -> CloudMounting:
+def lacks_optical_frame(T_base_sensor: Transform, kind: str, frame: str) -> bool:
+    """Whether depth images are in a frame of the camera's body: its z axis, along which they look, points up."""
+    return kind == IMAGE and "optical" not in frame and rotated(T_base_sensor.rotation, (0.0, 0.0, 1.0))[2] > _UP
+
+
+def given_cloud_mounting(pose: GivenPose, kind: str, frame: str) -> CloudMounting:
     """The mounting that the user gives, without a height; the sensor is level."""
     x, y, theta, *upside_down = pose
-    mounting = cloud_mounting(in_space(np.array([x, y, theta])))
+    mounting = cloud_mounting(in_space(np.array([x, y, theta])), POINT_CLOUD, frame)
     turn = np.diag([1.0, -1.0, -1.0]) if any(upside_down) else np.eye(3)
-    axes = _OPTICAL if "optical" in frame else np.eye(3)
+    axes = _OPTICAL if kind == IMAGE or "optical" in frame else np.eye(3)
     return mounting._replace(rotation=mounting.rotation @ turn @ axes, is_height_known=False)
 
 
-def cloud_of(content: Any, kind: str, bag_time_ns: int, calibration: Calibration | None = None) -> PointCloud:
-    """Convert a message of type ``kind``: a point cloud, or a depth image with its calibration."""
+def cloud_of(
+    content: Any,
+    kind: str,
+    bag_time_ns: int,
+    calibration: Calibration | None = None,
+    longest_s: float = LONGEST_SWEEP_S,
+) -> PointCloud:
+    """Convert a message of type ``kind``: a point cloud, or a depth image with its calibration.
+
+    A cloud takes at most ``longest_s``, as it ends before the next one.
+    """
     stamp, frame = header_of(content.header, bag_time_ns)
     if kind == IMAGE:
         return PointCloud(stamp, frame, _depth_points(content, calibration), np.empty(0))
@@ -55,8 +76,10 @@ def cloud_of(content: Any, kind: str, bag_time_ns: int, calibration: Calibration
         points = np.array([(each.x, each.y, each.z) for each in content.points], np.float64).reshape(-1, 3)
         times = np.array([each.offset_time for each in content.points], np.int64)
     measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
-    times_s: FloatArray = np.empty(0) if times is None else _seconds(times[measured], stamp)
-    return PointCloud(stamp, frame, points[measured], times_s)
+    points = points[measured]
+    if times is None:
+        return PointCloud(stamp, frame, points, np.empty(0))
+    return _timed(PointCloud(stamp, frame, points, np.empty(0)), times[measured], longest_s)
 
 
 def _fields(content: Any) -> tuple[FloatArray, Any]:
@@ -101,22 +124,31 @@ def _fields(content: Any) -> tuple[FloatArray, Any]:
     return points, values[name].astype(np.float64 if types[name][0].kind == "f" else np.int64)
 
 
-def _seconds(times: Any, stamp: float) -> FloatArray:
-    """Times of points after ``stamp``, from times of any usual unit and beginning; empty if they say nothing."""
-    if not len(times) or not np.isfinite(times).all():
-        return np.empty(0)
-    first = times.min()
-    after = (times - first).astype(np.float64)
+def _timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
+    """The cloud with the times of its points, of any usual unit and beginning; points with wrong times are left out.
+
+    Times that are none in any unit, as shares of a turn, give only the order of the points.
+    """
+    known = np.isfinite(times)
+    if not known.any():
+        return cloud
+    after = (times - np.sort(times[known])[np.count_nonzero(known) // 2]).astype(np.float64)
+    low, high = np.quantile(after[known], (0.5 - 0.5 * _BULK, 0.5 + 0.5 * _BULK)).tolist()
+    if low == high:
+        return cloud
+    is_near = np.abs(after - 0.5 * (low + high)) < (0.5 + _REACH) * (high - low)  # false for NaN
+    points, times, after = cloud.points[is_near], times[is_near], after[is_near]
+    cloud = cloud._replace(points=points, left_out=int(np.count_nonzero(~is_near)))
     for unit_s in _UNITS_S:
-        if _SHORTEST_CLOUD_S <= float(after.max()) * unit_s <= LONGEST_SWEEP_S:
+        if _SHORTEST_CLOUD_S <= (high - low) / _BULK * unit_s <= longest_s:
             break
     else:
-        return np.empty(0)
-    begin_s = min(float(first) * unit_s, float(first) * unit_s - stamp, key=abs)
+        return cloud._replace(points=points[np.argsort(after, kind="stable")], is_in_order=True)
+    first_s = float(times.min()) * unit_s
+    begin_s = min(first_s, first_s - cloud.stamp, key=abs)
     if abs(begin_s) > _NEAR_STAMP_S:
         begin_s = 0.0  # by another clock: the stamp is that of the first point
-    seconds: FloatArray = begin_s + after * unit_s
-    return seconds
+    return cloud._replace(times_s=begin_s + (after - after.min()) * unit_s)
 
 
 def _depth_points(content: Any, calibration: Calibration | None) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 from fcslam.errors import InputError
 from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, frozen
 from fcslam.sources.bags.camera import Calibration, check_image
-from fcslam.sources.bags.codec import LASER_SCANS, SCANS
+from fcslam.sources.bags.codec import LASER_SCANS
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, ScanMessage, measured_ranges, reversed_sweep
 from fcslam.sources.bags.options import GivenPose
@@ -55,11 +55,6 @@ class RecordedLaser(NamedTuple):
             yield (
                 f"{path}: the scans of {self.name} are its nearest points from {band.low_m:g} m to {band.high_m:g} m "
                 "above the floor (--sensors cloud-band chooses)"
-            )
-        if self.is_level and self.topic.type in SCANS and self.first.sweep is None:
-            yield (
-                f"{path}: the points of {self.name} have no times, or all the same, so the motion of the robot during "
-                "a cloud is corrected only if the drive shows how the sensor turns; let the driver publish them"
             )
 
 
