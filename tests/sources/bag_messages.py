@@ -63,9 +63,10 @@ def scan(stamp, ranges=(1.0,) * BEAMS, topic="/scan", bag_time=None, **fields):
     return Said(topic, SCAN, stamp if bag_time is None else bag_time, fields)
 
 
-def odom(stamp, pose, topic="/odom", bag_time=None, child="base_link", rotation=None):
+def odom(stamp, pose, topic="/odom", bag_time=None, child="base_link", rotation=None, parent="odom"):
     x, y, theta = pose
-    fields = {"stamp": stamp, "at": (x, y, 0.0), "rotation": rotation or quaternion(theta), "child": child}
+    rotation = rotation or quaternion(theta)
+    fields = {"stamp": stamp, "at": (x, y, 0.0), "rotation": rotation, "child": child, "parent": parent}
     return Said(topic, ODOM, stamp if bag_time is None else bag_time, fields)
 
 
@@ -97,6 +98,17 @@ def drive(scans=40, start=100.0):
         said += [odom(start + at, pose_at(at)), odom(start + at + 0.1, pose_at(at + 0.1))]
         said.append(scan(start + at + 0.05, ranges, bag_time=start + at + 0.07))
     return [*said, odom(start + 0.2 * scans, pose_at(0.2 * scans))]
+
+
+def without(said, topic):
+    return [message for message in said if message.topic != topic]
+
+
+def readings_in_tf(said):
+    """The same odometry in tf."""
+    for one in said:
+        if one.topic == "/odom":
+            yield tf(one.fields["stamp"], "odom", "base_link", one.fields["at"], one.fields["rotation"])
 
 
 def save(path: Path, said: Iterable[Said], compression: str = "", chunk_bytes: int | None = None) -> Path:
@@ -200,7 +212,7 @@ def _message(store, kind, fields):
     still = make("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
     return make(
         "nav_msgs/Odometry",
-        header=header("odom"),
+        header=header(fields["parent"]),
         child_frame_id=fields["child"],
         pose=make("geometry_msgs/PoseWithCovariance", pose, np.zeros(36)),
         twist=make("geometry_msgs/TwistWithCovariance", make("geometry_msgs/Twist", still, still), np.zeros(36)),

@@ -26,10 +26,12 @@ from tests.sources.bag_messages import (
     odom,
     payload_of,
     quaternion,
+    readings_in_tf,
     save,
     scan,
     text,
     tf,
+    without,
 )
 from tests.sources.carmen_text import refusal, scans_of
 
@@ -37,10 +39,6 @@ pytestmark = pytest.mark.slow
 
 FILES = ["run.bag", "run.mcap", "run.db3"]
 KINDS = [*FILES, "run"]
-
-
-def without(said, topic):
-    return [message for message in said if message.topic != topic]
 
 
 # Missing from the bag
@@ -57,6 +55,10 @@ REFUSED = {
     ),
     "a laser that moves": (
         drive(20)[1:] + [tf(100 + k, "base_link", "laser", (0.1 * k, 0.0, 0.0)) for k in range(4)],
+        "'laser' moves in 'base_link'",
+    ),
+    "a laser that nods": (
+        [*drive(20)[1:], *(tf(100 + k, "base_link", "laser", rotation=quaternion(pitch=0.2 * k)) for k in range(4))],
         "'laser' moves in 'base_link'",
     ),
     "a mounting in centimetres": (
@@ -105,6 +107,17 @@ def test_a_laser_with_a_second_parent_is_where_the_base_says(tmp_path, is_first)
     source = open_source(save(tmp_path / "run.bag", [stray, *drive(20)]))
     assert source.survey().scan_count == 20
     assert source.survey().lasers[0].T_base_laser == pytest.approx(LASER_POSE)
+
+
+@pytest.mark.parametrize(("height_m", "lean_rad"), [(0.1, 0.0), (0.0, 0.1)])
+def test_a_base_that_sways_with_its_body_has_its_laser_where_it_is_seen_from_above(tmp_path, height_m, lean_rad):
+    said = with_fields(drive(20)[1:], "/odom", child="base_footprint")
+    for k in range(80):
+        sway = math.sin(0.7 * k)
+        turned = quaternion(0.0, lean_rad * sway, lean_rad * math.cos(k))
+        said.append(tf(100 + 0.05 * k, "base_footprint", "base_link", (0.0, 0.0, 0.1 + height_m * sway), turned))
+    source = open_source(save(tmp_path / "run.mcap", [mounted(), *said]))
+    assert source.survey().lasers[0].T_base_laser == pytest.approx(LASER_POSE, abs=1e-6)
 
 
 def test_a_tilted_laser(tmp_path):
@@ -248,13 +261,6 @@ def test_the_field_that_is_wrong_is_named(tmp_path, fields, words):
 
 
 NOT_A_ROTATION = (0.0, 0.0, 0.0, 0.0)
-
-
-def readings_in_tf(said):
-    """The same odometry in tf."""
-    for one in said:
-        if one.topic == "/odom":
-            yield tf(one.fields["stamp"], "odom", "base_link", one.fields["at"], one.fields["rotation"])
 
 
 def test_odometry_without_an_orientation_is_read_from_tf(tmp_path):

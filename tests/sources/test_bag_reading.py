@@ -17,15 +17,18 @@ from tests.sources.bag_messages import (
     BEAMS,
     INCREMENT,
     LASER_POSE,
+    Said,
     drive,
     mounted,
     odom,
     pose_at,
     quaternion,
+    readings_in_tf,
     save,
     scan,
     text,
     tf,
+    without,
 )
 from tests.sources.carmen_text import drive as drive_log
 from tests.sources.carmen_text import peak_of, scans_of
@@ -113,6 +116,32 @@ def test_a_topic_of_odometry_is_preferred_to_tf_unless_tf_is_asked_for(tmp_path)
     bag = save(tmp_path / "run.bag", said)
     assert scans_of(open_source(bag))[0].T_odom_base[0] < 1.0
     assert scans_of(open_source(bag, BagOptions(odom_topic="tf")))[0].T_odom_base[0] == 7.0
+
+
+def test_odometry_in_a_map_is_left_for_any_other(tmp_path):
+    """A second filter corrects it, so it jumps."""
+    corrected = [odom(100.0 + 0.1 * k, (9.0, 0.0, 0.0), "/a/odom", parent="map") for k in range(40)]
+    for name, others in (("topic", drive(20)), ("tf", [*readings_in_tf(drive(20)), *without(drive(20), "/odom")])):
+        source = open_source(save(tmp_path / f"{name}.bag", [*corrected, *others]))
+        assert scans_of(source)[0].T_odom_base[0] < 1.0
+    alone = open_source(save(tmp_path / "alone.bag", [*corrected, *without(drive(20), "/odom")]))
+    assert scans_of(alone)[0].T_odom_base[0] == 9.0
+
+
+def test_stamps_of_zero_among_others_are_of_their_clock(tmp_path):
+    """As of a simulator, whose clock begins at zero."""
+    said = [Said(topic, kind, seconds + 1.7e9, fields) for topic, kind, seconds, fields in drive(40)]
+    right = scans_of(open_source(save(tmp_path / "right.bag", said)))
+    for zero in ("/scan", "/odom"):
+        some = [
+            Said(topic, kind, seconds, {**fields, "stamp": 0.0} if topic == zero and k % 4 < 2 else fields)
+            for k, (topic, kind, seconds, fields) in enumerate(said)
+        ]
+        source = open_source(save(tmp_path / f"{zero[1:]}.bag", some))
+        for expected, found in zip(right, scans_of(source), strict=True):
+            assert found.stamp == pytest.approx(expected.stamp, abs=1e-6)
+            np.testing.assert_allclose(found.T_odom_base, expected.T_odom_base, atol=1e-5)
+        assert f"messages of {zero} have no stamp; their times of recording count" in " ".join(source.survey().notes)
 
 
 def test_stamps_that_were_never_set_are_those_of_the_recording(tmp_path):

@@ -317,18 +317,13 @@ def _stated_share(stated: Sweep | None, assumed_s: float) -> float:
 
 
 def _track_of(odometry: list[Odometry]) -> OdometryTrack | None:
-    """The updates with growing stamps; None without any.
-
-    Of a clock that begins at 0, the first stamp is one that was never set, and reads as the time of recording.
-    """
+    """The updates with growing stamps; None without any."""
     updates = OdometryUpdates()
     fresh = [reading for reading in odometry if updates.is_fresh(reading.stamp, pose_of(reading.T_odom_base))]
     if not fresh:
         return None
     stamps = np.array([reading.stamp for reading in fresh])
-    after_all = np.concatenate(([True], stamps[1:] > np.maximum.accumulate(stamps)[:-1]))
-    before_all = np.concatenate((stamps[:-1] < np.minimum.accumulate(stamps[::-1])[::-1][1:], [True]))
-    grows = max(after_all, before_all, key=np.count_nonzero)
+    grows = np.concatenate(([True], stamps[1:] > np.maximum.accumulate(stamps)[:-1]))
     poses = np.array([reading.T_odom_base for reading in fresh])
     period_s = max(updates.period_s, float(np.median(np.diff(stamps[grows]))) if grows.sum() > 1 else 0.0)
     stamps, poses = stamps[grows], poses[grows]

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
 from typing import Any, Final, NamedTuple
@@ -28,6 +28,7 @@ from fcslam.sources.bags.codec import (
     FIX,
     IMAGE,
     LASER_SCANS,
+    NANOSECONDS,
     ODOMETRY,
     OLD_TRANSFORMS,
     SCANS,
@@ -44,10 +45,11 @@ from fcslam.sources.bags.messages import (
     header_of,
     odometry_of,
     scan_of,
+    stamp_ns_of,
     transforms_of,
 )
 from fcslam.sources.bags.records import MessagePlace, StoredMessage
-from fcslam.sources.bags.transforms import Link, TransformTree, differ
+from fcslam.sources.bags.transforms import Link, TransformTree, difference
 from fcslam.untrusted import ZSTD, LimitError, unpack
 
 _LATEST_NS: Final = int(np.iinfo(np.int64).max)
@@ -62,7 +64,7 @@ Content = ScanMessage | OdometryReading | list[StampedTransform] | ValueError
 """A decoded message, or why it is invalid."""
 
 
-@dataclass(slots=True)
+@dataclass
 class TopicCensus:
     """What the messages of a topic name, in the order of the files."""
 
@@ -72,7 +74,13 @@ class TopicCensus:
     frames: Counter[str] = field(default_factory=Counter)
     """Frames of scans, or child frames of odometry, with their numbers of messages."""
     links: dict[Link, list[Transform]] = field(default_factory=dict)
-    """Transforms of tf from a parent to a child: the first, and the first that differs from it."""
+    """Transforms of tf from a parent to a child: the first, and the first ones that differ from it in each way."""
+    odom_frames: set[str] = field(default_factory=set)
+    """Parent frames of odometry."""
+    lags_ns: "array[int]" = field(default_factory=partial(array, "q"))
+    """Times from the stamps of messages to their recording."""
+    unstamped: int = 0
+    """Messages with a stamp of zero."""
     broken: int = 0
     """Messages that are invalid."""
     first_broken: int = 0
@@ -84,20 +92,36 @@ class TopicCensus:
         first_ns, last_ns = self.span_ns if self.count else (time_ns, time_ns)
         self.count, self.span_ns = self.count + 1, (min(first_ns, time_ns), max(last_ns, time_ns))
 
+    @cached_property
+    def lag_ns(self) -> int:
+        """What the times of recording of messages without a stamp are less: the clock of the others counts."""
+        return int(np.median(self.lags_ns)) if self.unstamped and self.lags_ns else 0
+
+    def _note_stamp(self, header: Any, now_ns: int) -> None:
+        if stamp_ns := stamp_ns_of(header):
+            self.lags_ns.append(now_ns - stamp_ns)
+        else:
+            self.unstamped += 1
+
     def converted(self, message: StoredMessage, content: Any) -> Content | None:
         """Convert an object of rosbags; None for a point cloud. Raises ValueError if it is invalid."""
         now_ns = message.time_ns
+        if message.kind in (*SCANS, ODOMETRY):
+            self._note_stamp(content.header, now_ns)
         if message.kind in SCANS:
             self.frames[header_of(content.header, now_ns)[1]] += 1
             return scan_of(content, now_ns) if message.kind in LASER_SCANS else None
         if message.kind == ODOMETRY:
             reading = odometry_of(content, now_ns)
             self.frames[reading.base_frame] += 1
+            self.odom_frames.add(reading.odom_frame)
             return reading
         transforms = list(transforms_of(content, now_ns))
+        for entry in content.transforms:
+            self._note_stamp(entry.header, now_ns)
         for _, parent, child, transform in transforms:
             seen = self.links.setdefault((parent, child), [transform])
-            if len(seen) == 1 and differ(seen[0], transform):
+            if difference(seen[0], transform) >= len(seen):
                 seen.append(transform)
         return transforms
 
@@ -109,6 +133,8 @@ class BagMessage(NamedTuple):
     number: int
     """Counts the topic's messages from 1."""
     bag_time_ns: int
+    unstamped_ns: int
+    """The stamp if it has none."""
     decoded: Any
     """Of laser scans, odometry and tf as in ``Content``; of other types an object of rosbags. An error if invalid."""
 
@@ -171,8 +197,11 @@ class DecodedBag:
                     topic = by_number[number]
                     counts[topic] += 1
                     decoded: Any
+                    lag_ns = census[topic].lag_ns
                     if topic.type in _KEPT:
                         decoded = _unpacked(os.pread(tape, size, offset))
+                        if lag_ns:
+                            decoded = _restamped(decoded, time_ns, lag_ns)
                     else:
                         with parts[at].translated():
                             if at not in payloads:
@@ -182,7 +211,7 @@ class DecodedBag:
                             decoded = _decode(payload, topic.type, parts[at].file.ros1)
                         except ValueError as error:
                             decoded = error
-                    yield BagMessage(topic, counts[topic], time_ns, decoded)
+                    yield BagMessage(topic, counts[topic], time_ns, time_ns - lag_ns, decoded)
 
     @cached_property
     def _index(self) -> tuple[tuple[BagPart, ...], dict[Topic, TopicCensus], NDArray[np.int64], int]:
@@ -261,6 +290,19 @@ def _decode(payload: bytes, kind: str, ros1: bool) -> Any:
         except LimitError as error:
             raise ValueError(str(error)) from error
     return MessageCodec(ros1).decode(payload, kind)
+
+
+def _restamped(content: Content, time_ns: int, lag_ns: int) -> Content:
+    """The content of a topic by one clock: a stamp that is the time of recording was zero."""
+    if isinstance(content, ValueError):
+        return content
+    if isinstance(content, list):
+        return [each._replace(stamp=_by_one_clock(each.stamp, time_ns, lag_ns)) for each in content]
+    return content._replace(stamp=_by_one_clock(content.stamp, time_ns, lag_ns))
+
+
+def _by_one_clock(stamp: float, time_ns: int, lag_ns: int) -> float:
+    return (time_ns - lag_ns) / NANOSECONDS if stamp == time_ns / NANOSECONDS else stamp
 
 
 def _packed(content: Content) -> bytes:

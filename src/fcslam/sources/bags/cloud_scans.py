@@ -89,7 +89,7 @@ class BagScans:
         first_ns, last_ns = its.span_ns
         interval_s = len(its.frames) * (last_ns - first_ns) / (max(1, its.count - 1) * NANOSECONDS)
         longest_s = min(_OVER_INTERVAL * interval_s, LONGEST_SWEEP_S) or LONGEST_SWEEP_S
-        return cloud_of(message.content, topic.type, message.bag_time_ns, self._calibrations[topic], longest_s)
+        return cloud_of(message.content, topic.type, message.unstamped_ns, self._calibrations[topic], longest_s)
 
     def _mounting(self, topic: Topic, frame: str) -> CloudMounting:
         path = self._robot.bag.path

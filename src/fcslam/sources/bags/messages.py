@@ -172,8 +172,13 @@ def _angle_rad(single: float) -> float:
 
 def header_of(header: Any, bag_time_ns: int) -> tuple[float, str]:
     """Stamp and frame of a header; a zero stamp is replaced by the time of recording."""
-    stamp_ns = header.stamp.sec * NANOSECONDS + header.stamp.nanosec
-    return (stamp_ns or bag_time_ns) / NANOSECONDS, frame_of(header.frame_id)
+    return (stamp_ns_of(header) or bag_time_ns) / NANOSECONDS, frame_of(header.frame_id)
+
+
+def stamp_ns_of(header: Any) -> int:
+    """The stamp of a header."""
+    stamp_ns: int = header.stamp.sec * NANOSECONDS + header.stamp.nanosec
+    return stamp_ns
 
 
 def frame_of(name: str) -> str:

@@ -21,7 +21,7 @@ from fcslam.sources.bags.rig import RecordedLaser, recorded_laser
 from fcslam.sources.bags.robots import BagRobot, listed, usual
 from fcslam.sources.bags.sectors import cloud_sector_rad
 from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
-from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree
+from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree, is_corrected
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.gate import FIRST_MESSAGES, MAX_STEP_BACK_S
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
@@ -95,7 +95,7 @@ class BagPlan(NamedTuple):
                 if laser.topic == message.topic and laser.frame in (None, scan.frame)
             ]
         if message.topic == self.topics.camera:
-            return [image_of(message.content, message.topic.type, message.bag_time_ns)]
+            return [image_of(message.content, message.topic.type, message.unstamped_ns)]
         late_s = self.odometry_ahead_s + correction.odometry_delay_s
         readings = self.odometry.readings(message) if self.odometry else []
         return [reading._replace(stamp=reading.stamp - late_s) for reading in readings]
@@ -110,7 +110,7 @@ class _Planner:
     def __init__(self, robot: BagRobot, options: BagOptions) -> None:
         self._robot, self._options, self._bag, self._path = robot, options, robot.bag, robot.bag.path
         known = KnownTopics(robot.topics, robot.transforms, f"{robot.bag.path}: ")
-        self._topics = choose_topics(known, options, self._view_rad, self._has_images)
+        self._topics = choose_topics(known, options, self._view_rad, self._has_images, self._jumps)
         self._tree = robot.bag.tree(robot.transforms)
         self._scans = BagScans(robot, self._topics.scans, options, self._tree, self._base_frame_of)
         self._notes: list[str] = []
@@ -172,13 +172,15 @@ class _Planner:
         measured = self._measured
         if options.odom_topic is None and options.odom_frame is not None:
             measured = []
-        for topic in measured:
-            yield OdometryInput((topic,), None, self._base_frame(topic))
+        of_topics = [OdometryInput((topic,), None, self._base_frame(topic)) for topic in measured]
+        if link is None or (measured and options.odom_topic is not None):
+            yield from of_topics
         if measured and options.odom_topic is not None:
             return
         if link is not None:
             named = tuple(topic for topic in self._topics.odometry if topic.type != ODOMETRY)
-            yield OdometryInput(named or self._topics.transforms, link)
+            of_tf = OdometryInput(named or self._topics.transforms, link)
+            yield from [of_tf, *of_topics] if any(map(self._jumps, measured)) else [*of_topics, of_tf]
         elif options.odom_frame or (options.base_frame and not measured):
             known = ", ".join(f"{one_line(parent)} -> {one_line(child)}" for parent, child in self._tree.links)
             raise SourceError(
@@ -243,10 +245,14 @@ class _Planner:
         low_s, middle_s, high_s = quantiles(lags_s, n=4)
         return middle_s if high_s - low_s <= MAX_STEP_BACK_S else None
 
+    def _jumps(self, topic: Topic) -> bool:
+        frames = self._bag.census[topic].odom_frames
+        return bool(frames) and all(map(is_corrected, frames))
+
     def _has_images(self, topic: Topic) -> bool:
         images = valid(
             islice(self._bag.read([topic]), _IMAGES_TRIED),
-            lambda message: image_of(message.content, topic.type, message.bag_time_ns),
+            lambda message: image_of(message.content, topic.type, message.unstamped_ns),
         )
         return next(images, None) is not None
 

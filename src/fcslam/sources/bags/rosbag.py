@@ -16,6 +16,7 @@ from fcslam.errors import InputError, SourceError
 from fcslam.geometry import se2
 from fcslam.records import GnssFix, Odometry, SensorRecord, frozen
 from fcslam.sources.bags.census import DecodedBag
+from fcslam.sources.bags.container import is_transforms
 from fcslam.sources.bags.fixes import FIX_INTERVAL_S, fix_of, fix_topics
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, BeamsError, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
@@ -138,7 +139,7 @@ class RosBag:
         audit, found = _audit(), list[GnssFix]()
         for message in self.bag.read(fix_topics(self.robot)[:1]):
             try:
-                fix = fix_of(message.content, message.bag_time_ns, self.plan.tree, self._reading.base_frame)
+                fix = fix_of(message.content, message.unstamped_ns, self.plan.tree, self._reading.base_frame)
             except ValueError:
                 fix = Fault.BROKEN_MESSAGE
             if isinstance(fix, Fault):
@@ -221,6 +222,12 @@ class RosBag:
             camera, camera_note = mounted_camera(plan.calibration, tree, base_frame)
         notes = [
             *self.bag.notes,
+            *(
+                f"{self.path}: {its.unstamped} of {its.count} messages of {topic.name} have no stamp; their times of "
+                "recording count"
+                for topic, its in self.bag.census.items()
+                if topic in plan.read_topics(with_images=False) and not is_transforms(topic) and its.unstamped > 1
+            ),
             *(
                 f"{self.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
                 for laser, its_m in zip(lasers, farthest_m, strict=True)

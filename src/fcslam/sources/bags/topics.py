@@ -73,12 +73,14 @@ def choose_topics(
     options: BagOptions,
     field_of_view_rad: Callable[[Topic], float],
     has_images: Callable[[Topic], bool],
+    jumps: Callable[[Topic], bool],
 ) -> Topics:
     """Choose the topics of a robot to read, by these rules in order:
 
     - laser: laser scans before point clouds and these before depth images, the widest field of view (to 0.1 rad), one
       echo a beam, the name ``scan``, most messages, first by name;
-    - odometry: the name ``odom``, most messages, first by name; ground truth only if the user names it;
+    - odometry: not one that ``jumps``, as in a map; the name ``odom``, most messages, first by name; ground truth only
+      if the user names it;
     - camera: calibrated, most messages, compressed images, first by name.
     """
     heard, scans = known.heard, _scans(known)
@@ -107,7 +109,10 @@ def choose_topics(
         notes = [*_note(known, "laser scans", "--sensors scan-topic", lasers[0], scans), *notes]
     if measured := [topic for topic in odometries if topic.type == ODOMETRY]:
         odometries = [
-            min(measured, key=lambda topic: (last_part(topic.name) != "odom", -topic.message_count, topic.name))
+            min(
+                measured,
+                key=lambda each: (jumps(each), last_part(each.name) != "odom", -each.message_count, each.name),
+            )
         ]
         notes += _note(known, "odometry", "--sensors odom-topic", odometries[0], measured)
     return Topics(tuple(lasers), tuple(odometries), known.transforms, camera, camera_info, tuple(notes))

@@ -3,8 +3,10 @@
 from collections import deque
 from collections.abc import Iterator
 from itertools import pairwise
-from math import acos, atan2, cos, isfinite, pi, sin, sqrt
+from math import acos, atan2, cos, isfinite, pi, radians, sin, sqrt
 from typing import NamedTuple
+
+import numpy as np
 
 from fcslam.errors import FcslamError
 from fcslam.records import FloatArray, Transform
@@ -18,6 +20,8 @@ _ROUNDING = 1e-15
 """A quaternion whose length differs from 1 by less is not normalised."""
 _STILL = 0.01
 """Largest difference between the messages of a fixed transform, in metres or quaternion units."""
+_LARGEST_SWAY_RAD = radians(20.0)
+"""A body leans less on its wheels or legs; a laser that nods leans more."""
 
 
 class NoTransformError(FcslamError):
@@ -37,6 +41,7 @@ Link = tuple[str, str]
 """Names of the parent and the child of a transform."""
 USUAL_BASES = ("base_footprint", "base_link")
 """Frames of the robot's body, where no message names it."""
+_CORRECTED = ("map", "world", "earth", "utm")
 _NO_ODOMETRY = ("map", *USUAL_BASES)
 """Frames in which a robot jumps, or in which its joints move."""
 _FIXED = ("map", "world", "camera_init")
@@ -87,12 +92,13 @@ class TransformTree:
         """The first transform of each link, in the order in which they appeared; None if it moves."""
 
     def add(self, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Add a transform. The first one counts; a link whose transform changes later is moving."""
+        """Add a transform. The first one counts, level if it sways; a link whose transform moves later is moving."""
         if (parent, child) not in self.links:
             self._parents.setdefault(child, []).append(parent)
         of_link = self.links.setdefault((parent, child), T_parent_child)
-        if of_link is not None and differ(of_link, T_parent_child):
-            self.links[parent, child] = None
+        differs = 0 if of_link is None else difference(of_link, T_parent_child)
+        if of_link is not None and differs:
+            self.links[parent, child] = None if differs > 1 else _levelled(of_link)
 
     def __contains__(self, frame: str) -> bool:
         return frame in self._parents or any(parent == frame for parent, _ in self.links)
@@ -183,6 +189,11 @@ def is_odom(frame: str) -> bool:
     return "odom" in last_part(frame)
 
 
+def is_corrected(frame: str) -> bool:
+    """Whether poses in a frame of this name are corrected, and jump."""
+    return last_part(frame) in _CORRECTED
+
+
 def is_fixed(frame: str) -> bool:
     """Whether a frame of this name usually stands on the floor."""
     return is_odom(frame) or last_part(frame) in _FIXED
@@ -229,8 +240,21 @@ def _product(p: Quaternion, q: Quaternion) -> Quaternion:
     )
 
 
-def differ(first: Transform, second: Transform) -> bool:
-    """Whether two transforms differ by more than noise; q and -q are the same rotation."""
+def difference(first: Transform, second: Transform) -> int:
+    """How two transforms differ by more than noise: 0 not; 1 in height, roll or pitch, as a body sways; 2 otherwise.
+
+    q and -q are the same rotation.
+    """
     apart = max(abs(a - b) for a, b in zip(first.translation_m, second.translation_m, strict=True))
     alike = abs(sum(a * b for a, b in zip(first.rotation, second.rotation, strict=True)))
-    return apart > _STILL or alike < 1.0 - _STILL * _STILL
+    if apart <= _STILL and alike >= 1.0 - _STILL * _STILL:
+        return 0
+    (x, y, heading_rad), (other_x, other_y, other_rad) = planar(first), planar(second)
+    is_same = max(abs(x - other_x), abs(y - other_y)) <= _STILL and cos(heading_rad - other_rad) > cos(2.0 * _STILL)
+    is_upright = all(rotated(each.rotation, (0.0, 0.0, 1.0))[2] > cos(_LARGEST_SWAY_RAD) for each in (first, second))
+    return 1 if is_same and is_upright else 2
+
+
+def _levelled(transform: Transform) -> Transform:
+    x, y, z = transform.translation_m
+    return Transform((x, y, z), in_space(np.array(planar(transform))).rotation)
