@@ -33,7 +33,7 @@ _MAPS_DECIDE = ReasonCode.NOT_INFORMATIVE, ReasonCode.FEW_PLACES, *_NO_LEAD
 """Reasons that a comparison of the maps may refute."""
 _MAPS_REFUTE = ReasonCode.MAPS_CONTRADICT, ReasonCode.WALLS_DIFFER, ReasonCode.LOOK_ALIKE
 """Reasons of that comparison against a cluster; a smaller one that contradicts it may be right."""
-MOST_CLUSTERS = 4
+MOST_CLUSTERS = 8
 """Most clusters that are compared with the maps: a building that repeats itself has more."""
 
 DIRECTION_M = 1.0
@@ -191,6 +191,12 @@ def dominant_cluster(
     """
     xy, informs = np.asarray(places, dtype=np.float64), np.asarray(informative, dtype=bool)
     xy = xy.reshape(len(xy), xy.size // (2 * max(1, len(xy))), 2)
+    fits: dict[bytes, MapFit | None] = {}
+
+    def fit_of(rows: NDArray[np.int64]) -> MapFit | None:
+        if rows.tobytes() not in fits:
+            fits[rows.tobytes()] = examine(rows)
+        return fits[rows.tobytes()]
 
     def decide(rows: NDArray[np.int64], rivals: NDArray[np.int64]) -> tuple[ClusterEvidence, Reason | None]:
         evidence = replace(
@@ -201,14 +207,16 @@ def dominant_cluster(
         by_count = shortfall(evidence, settings)
         if by_count is not None and by_count.code not in _MAPS_DECIDE:
             return evidence, by_count
-        fit = examine(rows)
+        fit = fit_of(rows)
         lead = evidence.closures - LEAD * evidence.rival_closures
         if fit is not None and (lead < 0.0 or evidence.separate_places < evidence.rival_places):
-            rival = examine(rivals)
+            rival = fit_of(rivals)
             if rival is None:
                 return evidence, by_count
             if not rival.is_compared or refutation(rival) is None:
                 fit = replace(fit, rival_support=max(fit.rival_support, rival.support))
+            elif fit.is_compared:  # walls that differ speak louder than any number of closures
+                evidence = replace(evidence, rival_closures=0, rival_places=0)
         evidence = replace(evidence, fit=fit)
         return evidence, shortfall(evidence, settings)
 
