@@ -1,5 +1,6 @@
 """True closures agree, false ones do not, aliases agree with one another; cliques against brute force."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -126,6 +127,26 @@ def test_where_the_maps_refute_the_largest_cluster_they_may_confirm_the_one_that
     refuted = decide(lambda _: BAD)
     assert not refuted.dominant
     assert refuted.contested
+
+
+def test_clusters_that_the_maps_refute_outnumber_no_other() -> None:
+    sizes = 12, 9, 7, 6, 5, 4
+    group = np.repeat(np.arange(len(sizes)), sizes)
+    consistent = group[:, None] == group
+    places = np.array([(4.0 * k, 0.0) for k in range(len(group))])
+    places[group == 5] = places[-1]
+
+    def decide(right: int, fit: MapFit):
+        informative = np.ones(len(group), dtype=bool)
+        return dominant_cluster(
+            consistent, places, informative, SETTINGS, lambda rows: fit if (group[rows] == right).all() else BAD
+        )
+
+    found = decide(5, GOOD)
+    assert found.dominant
+    assert set(found.members) == set(np.flatnonzero(group == 5))
+    alike = replace(GOOD, rival_support=0.9 * GOOD.support)
+    assert not decide(5, alike).dominant
 
 
 def test_noise_alone_gives_no_verdict() -> None:
