@@ -215,7 +215,7 @@ def dominant_cluster(
                 return evidence, by_count
             if not rival.is_compared or refutation(rival) is None:
                 fit = replace(fit, rival_support=max(fit.rival_support, rival.support))
-            elif fit.is_compared:  # walls that differ speak louder than any number of closures
+            elif fit.is_compared and rival.support < 0.0:  # its walls say that it is another place
                 evidence = replace(evidence, rival_closures=0, rival_places=0)
         evidence = replace(evidence, fit=fit)
         return evidence, shortfall(evidence, settings)
