@@ -105,3 +105,17 @@ def test_unclear_match_is_kept_only_if_it_agrees_with_odometry(sigma_m, explaine
     match = off._replace(explained=explained * off.known)
     chosen, _ = resolve(scan, field, HERE, match, OdometryError(sigma_m, 0.02), 0.0)
     assert (chosen is match) == is_kept
+
+
+def test_where_no_surface_alone_pulls_a_match_from_odometry_the_trusting_one_has_tails():
+    """A corridor with a few narrow posts: held by ten times odometry's information, they would not move the robot."""
+    posts = [path((x, y), (x, 0.9 * y)) for x in (-6.0, -2.0, 3.0, 7.0) for y in (-3.0, 3.0)]
+    walls = np.vstack((path((-60, -3), (60, -3)), path((60, 3), (-60, 3)), *posts))
+    slip = np.array((0.15, 0.0, 0.0))
+    field, scan = field_of(points(walls)), points(walls).thinned(0.1, 180)
+    match = match_scan(scan, field, slip, np.diag((100.0, 100.0, 400.0)))
+    at_odometry = match_scan(scan, field, slip, HELD)
+    weak = match._replace(log_likelihoods=at_odometry.log_likelihoods)
+    chosen, contradicts = resolve(scan, field, slip, weak, RIGHT, 0.0)
+    assert contradicts
+    assert chosen.T_field_base == pytest.approx(HERE, abs=0.03)
