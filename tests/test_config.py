@@ -60,7 +60,7 @@ def test_a_file_overrides_only_what_it_names(tmp_path):
     ("content", "message"),
     [
         ({"sede": 1}, "unknown key 'sede'; did you mean 'seed'"),
-        ({"inner": {"reach": 1}}, "unknown key 'inner.reach'; did you mean 'reach_m'"),
+        ({"inner": {"reach": 1}}, "unknown key 'inner.reach'; did you mean 'inner.reach_m'"),
         ({"zzz": 1}, "known keys: seed, name, limit, colour, inner"),
         ({"inner": {"reach_m": -1}}, "inner.reach_m: Input should be greater than 0"),
         ({"inner": {"reach_m": float("nan")}}, "inner.reach_m"),

@@ -3,6 +3,7 @@
 import difflib
 import math
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -113,12 +114,23 @@ def _flow(value: Any) -> str:
 
 
 def _nearest(kind: type[Settings], loc: tuple[int | str, ...]) -> str:
-    """A hint with the known key that is most similar to the unknown key at ``loc``."""
-    model: Any = kind
-    for part in loc[:-1]:
-        model = model.model_fields[str(part)].annotation
-    near = difflib.get_close_matches(str(loc[-1]), list(model.model_fields), n=1, cutoff=0.5)
-    return f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(model.model_fields)}"
+    """A hint with the known key, of any section, whose name is most similar to the unknown key at ``loc``."""
+    asked = ".".join(str(part) for part in loc)
+    keys = list(_keys(kind))
+    names = difflib.get_close_matches(_name(asked), [_name(key) for key in keys], n=1, cutoff=0.6)
+    near = difflib.get_close_matches(asked, [key for key in keys if _name(key) in names], n=1, cutoff=0.0)
+    return f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(kind.model_fields)}"
+
+
+def _name(key: str) -> str:
+    return key.rpartition(".")[2]
+
+
+def _keys(kind: type[Settings], section: str = "") -> Iterator[str]:
+    for name, field in kind.model_fields.items():
+        yield section + name
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Settings):
+            yield from _keys(field.annotation, f"{section}{name}.")
 
 
 class _PlainLoader(yaml.SafeLoader):

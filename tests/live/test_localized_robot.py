@@ -131,7 +131,7 @@ def test_a_map_that_cannot_be_used_is_refused_in_one_line(building, scans, tmp_p
         return str(caught.value)
 
     assert "cannot be read as a map" in refusal(tmp_path / "missing")
-    assert "not a mission file" in refusal(tmp_path / "missing.fcslam")
+    assert "no such file" in refusal(tmp_path / "missing.fcslam")
     (tmp_path / "empty.fcslam").write_bytes(b"")
     assert "empty.fcslam" in refusal(tmp_path / "empty.fcslam")
     bare = np.full((50, 50), fcslam.Occupancy.UNKNOWN, np.uint8)

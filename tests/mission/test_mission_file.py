@@ -127,7 +127,7 @@ def test_a_mission_file_survives_the_run_folder(begun, tmp_path):
 
 def test_what_is_no_mission_file_is_told_in_one_line_and_stays_as_it_is(tmp_path):
     whole = GOLDEN.read_bytes()
-    with pytest.raises(SourceError, match=r"nowhere: not a mission file; `fcslam map` writes one"):
+    with pytest.raises(SourceError, match=r"nowhere: no such file; `fcslam map` writes mission.fcslam"):
         read_mission(tmp_path / "nowhere")
     shares = {f"cut{share}": whole[: int(share * len(whole))] for share in (0.01, 0.3, 0.99)}
     for name, content in {"empty": b"", "text": b"hello\n" * 999, **shares}.items():

@@ -35,6 +35,7 @@ _log = logging.getLogger(__name__)
 
 _AT_ONCE: Final = 1000
 """Packets that are read at once."""
+_SQLITE: Final = b"SQLite format 3\0"
 _COPIED_BYTES: Final = 1 << 20
 """Bytes of a file that are copied at once."""
 
@@ -173,8 +174,12 @@ def edit_mission(path: Path, contents: Sequence[Change | Undo], author: str, tim
 def mission_path(path: Path) -> Path:
     """The mission file that a user names by itself or by its run folder."""
     path = path / MISSION if path.is_dir() else path
-    if not path.is_file():
-        raise SourceError(f"{path}: not a mission file; `fcslam map` writes one into each run folder")
+    if not path.exists():
+        raise SourceError(f"{path}: no such file; `fcslam map` writes {MISSION} into each run folder")
+    with translate_errors(path), open_file(path) as file:
+        start = file.read(len(_SQLITE))
+    if start not in (_SQLITE, b""):
+        raise SourceError(f"{path}: not a mission file; `fcslam map` writes {MISSION} into each run folder")
     return path
 
 
