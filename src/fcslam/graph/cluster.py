@@ -15,7 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from fcslam.geometry.alignment import two_point_alignment
 from fcslam.geometry.groups import SE2, group_of
 from fcslam.graph.consistency import Closures, pairwise_consistency
-from fcslam.graph.evidence import LEAD, ClusterEvidence, ConsistencySettings, MapFit, refutation, shortfall
+from fcslam.graph.evidence import (
+    CLEAR_LIKENESS,
+    LEAD,
+    ClusterEvidence,
+    ConsistencySettings,
+    MapFit,
+    refutation,
+    shortfall,
+)
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray, Reason, ReasonCode
 
@@ -215,7 +223,8 @@ def dominant_cluster(
                 return evidence, by_count
             if not rival.is_compared or refutation(rival) is None:
                 fit = replace(fit, rival_support=max(fit.rival_support, rival.support))
-            elif fit.is_compared and rival.support < 0.0:  # its walls say that it is another place
+            elif fit.is_compared and fit.likeness >= CLEAR_LIKENESS and rival.support < 0.0:
+                # The walls decide: those of the rival say that it is another place.
                 evidence = replace(evidence, rival_closures=0, rival_places=0)
         evidence = replace(evidence, fit=fit)
         return evidence, shortfall(evidence, settings)
