@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fcslam.anchoring.anchors import anchoring_lines
 from fcslam.api import map_recordings
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
@@ -16,11 +17,14 @@ from fcslam.sources.bags.writer import write_bag
 from fcslam.sources.faults import Fault
 from tests.anchoring.test_plan import placed
 from tests.planned_building import LASER, WALLS, mapped, ranges_at, sides, true_poses
+from tests.sources.bag_messages import ROS2, Said, drive, save
+from tests.sources.clouds import header
 
 pytestmark = pytest.mark.slow
 
 pyproj = pytest.importorskip("pyproj")
 
+FIX = "sensor_msgs/msg/NavSatFix"
 ORIGIN = (47.3769, 8.5417, 400.0)
 ANTENNA = (-0.3, 0.2)
 SIGMA_M = 0.3
@@ -66,6 +70,35 @@ def test_fixes_place_a_map_on_the_earth(T_earth_building):
     result, true = mapped()
     placing = placed(fixed(result, fixes_of(true, T_earth_building, 0.05)))
     assert off_m(placing, true, T_earth_building).max() < 0.15
+
+
+def test_errors_that_are_larger_than_stated_are_found():
+    T, (result, true) = (35.0, -20.0, 0.7), mapped()
+    fixes = tuple(replace(fix, sigma_m=0.01) for fix in fixes_of(true, T))
+    placing = placed(fixed(result, fixes))
+    assert off_m(placing, true, T).mean() < SIGMA_M
+    assert json.loads(placing.files["map_georeference.json"])["sigma_m"] == pytest.approx(SIGMA_M, rel=0.3)
+    (line,) = (each for each in anchoring_lines(placing.files) if "covariance" in each)
+    assert "their covariance says 0.01 m; 0.26 m is used" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: p[:, ::-1], "with latitude and longitude exchanged"),
+        (np.radians, "with radians for degrees"),
+        (lambda p: np.trunc(p) + 0.6 * (p - np.trunc(p)), "with a scale of 0.6"),
+    ],
+)
+def test_coordinates_that_are_wrong_place_nothing_and_are_named(change, words):
+    result, true = mapped()
+    fixes = fixes_of(true, (35.0, -20.0, 0.7), 0.05)
+    wrong = change(np.array([(fix.latitude_deg, fix.longitude_deg) for fix in fixes])).tolist()
+    both = zip(fixes, wrong, strict=True)
+    placing = placed(fixed(result, tuple(replace(fix, latitude_deg=a, longitude_deg=b) for fix, (a, b) in both)))
+    found = json.loads(placing.files["map_georeference.json"])
+    assert not found["georeferenced"]
+    assert words in found["reason"]
 
 
 def test_fixes_that_contradict_the_others_bend_nothing():
@@ -130,6 +163,29 @@ def test_a_bag_gives_its_fixes_and_names_those_at_zero(tmp_path, suffix):
     assert {fix.antenna_xy for fix in found} == {ANTENNA}
     assert {fix.sigma_m for fix in found} == {1.5}
     assert bag.faults[Fault.FIX_AT_ZERO].count == 1
+
+
+def fix_message(stamp, status, latitude=47.0):
+    make = ROS2.types
+    return make[FIX](
+        header=header(ROS2, stamp, "gps"), status=make["sensor_msgs/msg/NavSatStatus"](status=status, service=1),
+        latitude=latitude, longitude=8.5, altitude=400.0, position_covariance=np.zeros(9), position_covariance_type=0,
+    )  # fmt: skip
+
+
+def test_fixes_of_each_status_are_used_or_counted_by_the_clock_of_the_scans(tmp_path):
+    messages = drive(200)
+    for k, status in enumerate((0, -1, -2, -2) * 9):
+        at, ahead = 100.0 + k, fix_message(118.0 + k, status)
+        messages.append(Said("/fix", FIX, at, {"payload": ROS2.serialize_cdr(ahead, FIX)}))
+    exchanged = ROS2.serialize_cdr(fix_message(154.0, 0, 121.0), FIX)
+    messages.append(Said("/fix", FIX, 136.0, {"payload": exchanged}))
+    bag = RosBag(save(tmp_path / "run.mcap", messages), "run")
+    found = [record.stamp for record in bag.records() if isinstance(record, GnssFix)]
+    assert found == pytest.approx([100.0 + k for k in range(36) if k % 4 != 1], abs=0.1)
+    counts = {kind: bag.faults[kind].count for kind in bag.faults.counts}
+    assert counts == {Fault.NO_FIX: 9, Fault.UNKNOWN_FIX: 18, Fault.FIX_EXCHANGED: 1}
+    assert "the clock of /fix is 18.0" in " ".join(bag.survey().notes)
 
 
 def test_fixes_are_part_of_the_mission_and_place_it_again(tmp_path):

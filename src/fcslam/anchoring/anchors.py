@@ -158,16 +158,17 @@ def _plan_report(k: int, alignment: "PlanAlignment", mapped: Submap, scales: Map
 
 
 def _geo_report(found: "Georeference") -> dict[str, object]:
+    counts: dict[str, float] = {"fixes": found.fixes, "ignored": found.ignored}
+    counts |= {"sigma_m": round(found.sigma_m, 4), "stated_sigma_m": round(found.stated_sigma_m, 4)}
     if found.refusal:
-        return {"georeferenced": False, "reason": found.refusal, "fixes": found.fixes, "ignored": found.ignored}
+        return {"georeferenced": False, "reason": found.refusal, **counts}
     return {
         "georeferenced": True,
         "latitude_deg": round(found.latitude_deg, 9),
         "longitude_deg": round(found.longitude_deg, 9),
         "altitude_m": round(found.altitude_m, 3),
         "x_axis_from_east_deg": round(float(np.degrees(found.heading_rad)), 6),
-        "fixes": found.fixes,
-        "ignored": found.ignored,
+        **counts,
     }
 
 
@@ -224,5 +225,8 @@ def anchoring_lines(files: Mapping[str, bytes]) -> Iterator[str]:
             if report["georeferenced"]:
                 at = f"{report['latitude_deg']:.7f}, {report['longitude_deg']:.7f}"
                 yield f"{where} has its origin at {at}; {count - ignored} of {count} fixes agree"
+                if report["sigma_m"] > report["stated_sigma_m"]:
+                    differ, said = f"{report['sigma_m']:.2g} m", f"{report['stated_sigma_m']:.2g} m"
+                    yield f"the fixes of {where} differ by {differ}, their covariance says {said}; {differ} is used"
             else:
                 yield f"{where} is not placed on the earth: {report['reason']}"

@@ -5,7 +5,7 @@ others are weak factors of the pose graph. Coordinates are metres east and north
 are known, on the plane that touches the ellipsoid there (azimuthal equidistant projection of PROJ).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -24,10 +24,20 @@ CORRELATED_S: Final = 10.0
 """Fixes in this time have the errors of one: those of satellites, air and reflections change slowly."""
 LEAST_FIXES, LEAST_SHARE = 10, 0.3
 """Least number of fixes that agree, and least share of them."""
+LEAST_INDEPENDENT: Final = 5.0
+"""Fixes with errors of their own that show their errors."""
+MISSTATED: Final = 1.5
+"""Ratio of the errors of the fixes to the stated ones from which the stated ones are wrong."""
+MOST_SPREAD: Final = 0.1
+"""Largest ratio of errors that nobody stated to the extent of the map: beyond, the fixes are not of its path."""
+CLEARLY_MORE: Final = 1.5
+"""Ratio of the fixes that agree with changed coordinates to those that agree as they are, if these are wrong."""
 MOST_TURN_RAD: Final = float(np.radians(3.0))
 """Largest standard deviation of the map's heading by the fixes that agree."""
 HYPOTHESES: Final = 400
 """Pairs of fixes from which the pose of the map is guessed."""
+_MEDIAN_OFF: Final = 1.1774
+"""Half of all points of a plane with a standard deviation of 1 along both axes are nearer to their mean."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +51,10 @@ class Georeference:
     """Fixes that contradict the others."""
     refusal: str = ""
     """Why the map is not placed; empty if it is."""
+    sigma_m: float = 0.0
+    """Standard deviation of the fixes that agree, by their distances from the path."""
+    stated_sigma_m: float = 0.0
+    """The same as the receiver states it."""
     latitude_deg: float = 0.0
     """Latitude of the map's origin; the longitude and altitude are also those of the origin."""
     longitude_deg: float = 0.0
@@ -60,6 +74,8 @@ class _Measured:
     """Shape (N,)."""
     spread: float
     """Factor by which correlation in time enlarges the standard deviations."""
+    factor: float = 1.0
+    """Factor by which the standard deviations are larger than stated."""
 
     def antennas(self, poses: FloatArray) -> FloatArray:
         """Positions of the antenna, shape (N, 2), by poses of the variables."""
@@ -69,9 +85,9 @@ class _Measured:
         antennas: FloatArray = at[:, :2] + np.column_stack((cos * x - sin * y, sin * x + cos * y))
         return antennas
 
-    def agrees(self, antennas: FloatArray) -> NDArray[np.bool_]:
-        """Which fixes agree with positions of the antenna (N, 2), shape (N,)."""
-        off: NDArray[np.bool_] = np.hypot(*(antennas - self.east_north).T) < OUTLIER * self.sigma_m
+    def off(self, antennas: FloatArray) -> FloatArray:
+        """How far positions of the antenna (N, 2) are from the fixes, in their standard deviations; shape (N,)."""
+        off: FloatArray = np.hypot(*(antennas - self.east_north).T) / self.sigma_m
         return off
 
 
@@ -85,70 +101,120 @@ def georeferenced(part: MapPart, is_fixed: bool) -> Georeference | None:
     if not kept:
         return None
     at = [np.array([fix.id.number for fix in robot.fixes], np.int64) for robot in robots]
+    stated_m = np.array([fix.sigma_m for fix in kept])
+    positions = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in kept])
     try:
-        from pyproj import Proj
+        projection, east_north = _projected(positions)
     except ImportError:
         return Georeference(part, len(kept), 0, "fixes need pyproj; install it: pip install 'fcslam[gnss]'")
-    middle = np.median([(fix.latitude_deg, fix.longitude_deg, fix.altitude_m) for fix in kept], axis=0)
-    projection: Any = Proj(proj="aeqd", lat_0=middle[0], lon_0=middle[1], ellps="WGS84")
-    east, north = projection([fix.longitude_deg for fix in kept], [fix.latitude_deg for fix in kept])
     gaps_s = np.concatenate([np.diff(np.sort(robot.stamps[rows])) for robot, rows in zip(robots, at, strict=True)])
     interval_s = float(np.median(gaps_s)) if len(gaps_s) else CORRELATED_S
     measured = _Measured(
         np.concatenate([robot.variables[rows] for robot, rows in zip(robots, at, strict=True)]),
         np.array([fix.antenna_xy for fix in kept]),
-        np.column_stack((east, north)),
-        np.maximum(LEAST_SIGMA_M, [fix.sigma_m for fix in kept]),
+        east_north,
+        np.maximum(LEAST_SIGMA_M, stated_m),
         max(1.0, CORRELATED_S / max(interval_s, 1e-3)) ** 0.5,
     )
     poses = part.graph.poses()
-    T, agreeing = _vote(measured, measured.antennas(poses))
-    refusal = _refusal(measured, agreeing)
+    antennas = measured.antennas(poses)
+    measured, T, agreeing = _vote(measured, antennas)
+    refusal = _refusal(measured, T, antennas, agreeing)
+    if refusal or agreeing.mean() < 1.0 / CLEARLY_MORE:
+        count = int(agreeing.sum())
+        if explanation := _explanation(measured, antennas, positions, 0 if refusal else count):
+            refusal = f"{refusal or f'{count} of {len(agreeing)} fixes agree'}; {explanation}"
+    sigma_m = float(np.median(measured.sigma_m))
+    sigmas_m = sigma_m, float(np.median(stated_m)) if measured.factor > 1.0 else sigma_m
     if refusal:
-        return Georeference(part, len(kept), int((~agreeing).sum()), refusal)
+        return Georeference(part, len(kept), int((~agreeing).sum()), refusal, *sigmas_m)
     if not is_fixed:
         poses, agreeing = _solve(part.graph, se2.compose(T, poses), measured, agreeing)
         part, T = part.at(poses), np.zeros(3)
     longitude, latitude = projection(*T[:2].tolist(), inverse=True)
     ignored = int((~agreeing).sum())
-    return Georeference(part, len(kept), ignored, "", latitude, longitude, float(middle[2]), float(T[2]))
+    altitude_m = float(np.median([fix.altitude_m for fix in kept]))
+    return Georeference(part, len(kept), ignored, "", *sigmas_m, latitude, longitude, altitude_m, float(T[2]))
 
 
-def _vote(measured: _Measured, antennas: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """The motion of the map with which most fixes agree, by pairs of fixes that lie apart; then by all that agree."""
+def _projected(positions: FloatArray) -> tuple[Any, FloatArray]:
+    """The projection around latitudes and longitudes, shape (N, 2), and their metres east and north."""
+    from pyproj import Proj
+
+    latitude, longitude = np.median(positions, axis=0)
+    projection = Proj(proj="aeqd", lat_0=latitude, lon_0=longitude, ellps="WGS84")
+    return projection, np.column_stack(projection(positions[:, 1], positions[:, 0]))
+
+
+def _vote(measured: _Measured, antennas: FloatArray) -> tuple[_Measured, FloatArray, NDArray[np.bool_]]:
+    """The motion of the map to which most fixes are near, by pairs of fixes that lie apart; then by all that agree.
+
+    Distances from the map that are larger than stated show how large the errors are.
+    """
     rng = np.random.default_rng(0)
-    best, agreeing = np.zeros(3), np.zeros(len(antennas), bool)
+    needed = min(len(antennas), _needed(len(antennas))) - 1
+    apart_m = np.hypot(*antennas.std(axis=0))
+    best, off, nearest = np.zeros(3), np.full(len(antennas), np.inf), np.inf
     for _ in range(HYPOTHESES):
         i, j = rng.integers(len(antennas), size=2)
-        if np.hypot(*(antennas[i] - antennas[j])) < OUTLIER * max(measured.sigma_m[i], measured.sigma_m[j]):
+        if not np.hypot(*(antennas[i] - antennas[j])) > apart_m:
             continue
         T = n_point_alignment(measured.east_north[[i, j]], antennas[[i, j]])
-        votes = measured.agrees(se2.transform(T, antennas))
-        if votes.sum() > agreeing.sum():
-            best, agreeing = T, votes
-    for _ in range(ROUNDS):
+        distances = measured.off(se2.transform(T, antennas))
+        if (reach := np.partition(distances, needed)[needed]) < nearest:
+            best, off, nearest = T, distances, reach
+    agreeing, factor = off <= nearest, 1.0
+    for _ in range(2 * ROUNDS):
         if agreeing.sum() < 2:
             break
         weights = measured.sigma_m[agreeing] ** -2.0
         T = n_point_alignment(measured.east_north[agreeing], antennas[agreeing], weights)
         if not np.isfinite(T).all():
             break
-        best, agreeing = T, measured.agrees(se2.transform(T, antennas))
-    return best, agreeing
+        best, off = T, measured.off(se2.transform(T, antennas))
+        factor = float(np.median(off[agreeing])) / _MEDIAN_OFF
+        factor = factor if factor > MISSTATED else 1.0
+        agreeing = off < OUTLIER * factor
+    return replace(measured, sigma_m=factor * measured.sigma_m, factor=factor), best, agreeing
 
 
-def _refusal(measured: _Measured, agreeing: NDArray[np.bool_]) -> str:
-    count = int(agreeing.sum())
-    if count < max(LEAST_FIXES, LEAST_SHARE * len(agreeing)):
-        return f"{count} of {len(agreeing)} fixes agree, {max(LEAST_FIXES, LEAST_SHARE * len(agreeing)):.0f} needed"
+def _needed(count: int) -> int:
+    return max(LEAST_FIXES, round(LEAST_SHARE * count))
+
+
+def _refusal(measured: _Measured, T: FloatArray, antennas: FloatArray, agreeing: NDArray[np.bool_]) -> str:
+    count, sigmas_m = int(agreeing.sum()), measured.sigma_m
+    if count < _needed(len(agreeing)):
+        return f"{count} of {len(agreeing)} fixes agree, {_needed(len(agreeing))} needed"
+    if measured.factor > 1.0 and np.median(sigmas_m) > MOST_SPREAD * np.hypot(*antennas.std(axis=0)):
+        return f"the fixes differ by {np.median(sigmas_m):.1f} m from the path of the robots"
     at = measured.east_north[agreeing] - measured.east_north[agreeing].mean(axis=0)
-    sigma_m = float(np.sqrt(np.mean(measured.sigma_m[agreeing] ** 2))) * measured.spread
-    turn_rad = sigma_m / max(1e-9, float(np.sqrt((at**2).sum())))
+    sigma_m = float(np.sqrt(np.mean(sigmas_m[agreeing] ** 2)))
+    if len(agreeing) >= LEAST_INDEPENDENT * measured.spread**2:  # they may be better than they state, too
+        off_m = (measured.off(se2.transform(T, antennas)) * sigmas_m)[agreeing]
+        sigma_m = min(sigma_m, float(np.sqrt(0.5 * np.mean(off_m**2))))
+    turn_rad = measured.spread * sigma_m / max(1e-9, float(np.sqrt((at**2).sum())))
     if turn_rad > MOST_TURN_RAD:
         return (
             f"the fixes fix the map's heading to {np.degrees(turn_rad):.1f} deg only, "
             f"{np.degrees(MOST_TURN_RAD):.0f} deg needed; drive farther outdoors"
         )
+    return ""
+
+
+def _explanation(measured: _Measured, antennas: FloatArray, positions: FloatArray, count: int) -> str:
+    """With which change of the coordinates clearly more than ``count`` fixes agree; empty if with none."""
+    stated = replace(measured, sigma_m=measured.sigma_m / measured.factor, factor=1.0)
+    size = np.hypot(*measured.east_north.std(axis=0)) / np.hypot(*antennas.std(axis=0))
+    changed = {"east and north": measured.east_north[:, ::-1], f"a scale of {size:.3g}": measured.east_north / size}
+    for name, each in (("latitude and longitude", positions[:, ::-1]), ("radians for degrees", np.degrees(positions))):
+        if np.abs(each).max() <= 90.0:
+            changed[name] = _projected(each)[1]
+    for name, east_north in reversed(changed.items()):
+        its, T, agreeing = _vote(replace(stated, east_north=east_north), antennas)
+        if agreeing.sum() > CLEARLY_MORE * count and not _refusal(its, T, antennas, agreeing):
+            what = f"{name} exchanged" if " and " in name else name
+            return f"with {what}, {agreeing.sum()} of {len(agreeing)} agree: correct the driver of the receiver"
     return ""
 
 
@@ -168,7 +234,7 @@ def _solve(
             if agreeing[row]
         ]
         poses = optimize_anchored(graph, poses, priors)
-        before, agreeing = agreeing, measured.agrees(measured.antennas(poses))
+        before, agreeing = agreeing, measured.off(measured.antennas(poses)) < OUTLIER
         if np.array_equal(before, agreeing):
             break
     return poses, agreeing

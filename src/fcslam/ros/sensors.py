@@ -171,13 +171,14 @@ class LiveSensors:
     def _fix(self, topic: str, payload: bytes, received_ns: int) -> Iterator[GnssFix]:
         if self._plan is None:
             return
+        fix: GnssFix | Fault
         try:
             fix = fix_of(self._codec.decode(payload, FIX), received_ns, self.planner.tree, self.planner.base_frame)
         except ValueError:
             fix = Fault.BROKEN_MESSAGE
         if isinstance(fix, Fault):
             self.audit.add(fix, self._counts[topic])
-        elif fix is not None:
+        else:
             yield fix
 
     def _decoded(self, topic: str, payload: bytes, received_ns: int) -> list[Message]:

@@ -14,6 +14,8 @@ from fcslam.sources.faults import Fault
 SIGMA_M: Final = {0: 5.0, 1: 2.0, 2: 0.5}
 """Standard deviations of fixes with an unknown covariance, by status: alone, with corrections by satellite, by ground
 stations."""
+NO_FIX: Final = -1
+"""STATUS_NO_FIX; below, the status is unknown, as in messages that nobody set it in."""
 FIX_INTERVAL_S: Final = 0.9
 """Least time between two fixes that are used; the errors of nearer ones are the same."""
 HIGHEST_M: Final = 1e5
@@ -29,16 +31,18 @@ def fix_topics(robot: BagRobot) -> list[Topic]:
     return sorted(topics, key=lambda topic: (-topic.message_count, topic.name))
 
 
-def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str) -> GnssFix | Fault | None:
-    """Convert a message; None if it states that there is no fix.
+def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str) -> GnssFix | Fault:
+    """Convert a message, or say what it lacks; a status that is not known counts as a fix.
 
     Latitude and longitude 0 are a fault: the receiver has no fix, and does not say so.
     """
-    if content.status.status < 0:  # STATUS_NO_FIX
-        return None
+    if content.status.status == NO_FIX:
+        return Fault.NO_FIX
     latitude, longitude, altitude = float(content.latitude), float(content.longitude), float(content.altitude)
     if latitude == 0.0 == longitude:
         return Fault.FIX_AT_ZERO
+    if abs(longitude) <= 90.0 < abs(latitude) <= 180.0:
+        return Fault.FIX_EXCHANGED
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):  # false for NaN
         raise ValueError(f"latitude {latitude:g}, longitude {longitude:g} are not a position on the earth")
     stamp, frame = header_of(content.header, bag_time_ns)

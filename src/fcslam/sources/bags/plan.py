@@ -1,6 +1,7 @@
 """Decides once, before a bag is read, which of its topics and frames are read, and how."""
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
 from itertools import chain, islice
 from math import degrees, tau
 from statistics import quantiles
@@ -14,7 +15,8 @@ from fcslam.sources.bags.census import BagMessage
 from fcslam.sources.bags.cloud_scans import BagScans, calibration_in, valid
 from fcslam.sources.bags.codec import LASER_SCANS, ODOMETRY
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.messages import OdometryReading, odometry_in
+from fcslam.sources.bags.fixes import fix_topics
+from fcslam.sources.bags.messages import OdometryReading, header_of, odometry_in
 from fcslam.sources.bags.options import NO_ODOMETRY, BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Message
 from fcslam.sources.bags.rig import RecordedLaser, recorded_laser
@@ -66,6 +68,8 @@ class BagPlan(NamedTuple):
     """The chosen topic, else tf; one that says nothing is none."""
     odometry_ahead_s: float
     """The clock of the odometry against that of the scans."""
+    fixes_ahead_s: float
+    """The same of the fixes."""
     calibration: Calibration | None
     """Of the camera; None without a camera or a readable calibration."""
     odometry_notes: tuple[str, ...]
@@ -124,10 +128,17 @@ class _Planner:
             for frame in self._robot.scan_frames.get(topic.name, (None,))
         )
         odometry = self._odometry(lasers[0].first.frame)
-        ahead_s = 0.0 if odometry is None else self._clock_ahead_s(odometry)
+        ahead_s = fixes_ahead_s = 0.0
+        if odometry is not None:
+            readings, read = odometry.readings, odometry.topics
+            ahead_s = self._ahead_s(odometry.name, read, lambda message: [each.stamp for each in readings(message)])
+        for fixes in fix_topics(self._robot)[:1]:
+            fixes_ahead_s = self._ahead_s(
+                fixes.name, [fixes], lambda message: [header_of(message.content.header, message.unstamped_ns)[0]]
+            )
         calibration = calibration_in(self._robot, topics.camera_info)
         notes = tuple(self._notes)
-        return BagPlan(topics, self._tree, self._scans, lasers, odometry, ahead_s, calibration, notes)
+        return BagPlan(topics, self._tree, self._scans, lasers, odometry, ahead_s, fixes_ahead_s, calibration, notes)
 
     def _laser(self, topic: Topic, frame: str | None) -> RecordedLaser:
         own = (scan for scan in self._scans.of(topic) if frame in (None, scan.frame))
@@ -221,17 +232,21 @@ class _Planner:
             for scan in islice(found, None, None, _STRIDE)
         )
 
-    def _clock_ahead_s(self, odometry: OdometryInput) -> float:
-        band = self._options.cloud_band
-        scans_s = self._lag_s(self._topics.scans[:1], lambda message: [self._scans.scan(message, band).end])
-        odometry_s = self._lag_s(odometry.topics, lambda message: [each.stamp for each in odometry.readings(message)])
-        if scans_s is None or odometry_s is None or abs(scans_s - odometry_s) < MAX_STEP_BACK_S:
+    def _ahead_s(self, name: str, topics: Sequence[Topic], stamps_of: Callable[[BagMessage], list[float]]) -> float:
+        """How far the clock of these topics is ahead of that of the scans."""
+        lag_s = self._lag_s(topics, stamps_of)
+        if lag_s is None or self._scans_lag_s is None or abs(self._scans_lag_s - lag_s) < MAX_STEP_BACK_S:
             return 0.0
         self._notes.append(
-            f"{self._path}: the clock of {odometry.name} is {scans_s - odometry_s:.3f} s ahead of that of the scans by "
-            "the times of recording; corrected"
+            f"{self._path}: the clock of {name} is {self._scans_lag_s - lag_s:.3f} s ahead of that of the scans by the "
+            "times of recording; corrected"
         )
-        return scans_s - odometry_s
+        return self._scans_lag_s - lag_s
+
+    @cached_property
+    def _scans_lag_s(self) -> float | None:
+        band = self._options.cloud_band
+        return self._lag_s(self._topics.scans[:1], lambda message: [self._scans.scan(message, band).end])
 
     def _lag_s(self, topics: Sequence[Topic], ends_of: Callable[[BagMessage], list[float]]) -> float | None:
         """Usual time from the measurement to the recording of a message; None if it varies, or there are too few."""

@@ -17,7 +17,7 @@ from fcslam.geometry import se2
 from fcslam.records import GnssFix, Odometry, SensorRecord, frozen
 from fcslam.sources.bags.census import DecodedBag
 from fcslam.sources.bags.container import is_transforms
-from fcslam.sources.bags.fixes import FIX_INTERVAL_S, fix_of, fix_topics
+from fcslam.sources.bags.fixes import FIX_INTERVAL_S, NO_FIX, fix_of, fix_topics
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, BeamsError, OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
@@ -138,14 +138,17 @@ class RosBag:
     def _fixes(self) -> tuple[tuple[GnssFix, ...], Faults]:
         audit, found = _audit(), list[GnssFix]()
         for message in self.bag.read(fix_topics(self.robot)[:1]):
+            fix: GnssFix | Fault
             try:
                 fix = fix_of(message.content, message.unstamped_ns, self.plan.tree, self._reading.base_frame)
             except ValueError:
                 fix = Fault.BROKEN_MESSAGE
             if isinstance(fix, Fault):
                 audit.add(fix, message.number)
-            elif fix is not None:
-                found.append(fix)
+                continue
+            if message.content.status.status < NO_FIX:
+                audit.add(Fault.UNKNOWN_FIX, message.number)
+            found.append(replace(fix, stamp=fix.stamp - self.plan.fixes_ahead_s))
         apart: list[GnssFix] = []
         for fix in sorted(found, key=lambda fix: fix.stamp):
             if not apart or fix.stamp >= apart[-1].stamp + FIX_INTERVAL_S:
