@@ -320,7 +320,7 @@ def test_a_fix_of_satellite_navigation_has_the_antenna_that_tf_says():
     robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
     robot.hears("/tf_static", transform(0.0, "base_link", "gnss", (-0.3, 0.2, 0.0)))
     robot.drives(np.arange(1.0, 9.0))
-    robot.hears("/fix", fix(8.1, 47.0, 8.5)).hears("/fix", fix(8.2, 0.0, 0.0)).hears("/fix", fix(8.3, 91.0, 8.5))
+    robot.hears("/fix", fix(8.1, 47.0, 8.5)).hears("/fix", fix(8.2, 0.0, 0.0)).hears("/fix", fix(8.3, 191.0, 8.5))
     found = [record for record in robot.records if isinstance(record, GnssFix)]
     assert [(each.stamp, each.latitude_deg, each.longitude_deg) for each in found] == [(8.1, 47.0, 8.5)]
     assert found[0].antenna_xy == pytest.approx((-0.3, 0.2))
