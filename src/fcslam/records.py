@@ -425,6 +425,8 @@ class VoxelMap:
     """In ``ground``, shape (N, 3): one point in each voxel with returns, by ``geometry.voxels.voxelised``."""
     origins: Steps
     """Where the scanner was, in ``ground``, shape (M, 3)."""
+    seen_from: NDArray[np.uint8]
+    """From which of the origins each point was seen, shape (N,)."""
 
     @property
     def points_m(self) -> FloatArray:

@@ -99,6 +99,7 @@ VOXEL_MAP = VoxelMap(
     frozen([0.0, 0.0, -0.125, 0.5, 0.5, -0.5, 0.5]),
     frozen([[-640, -640, -320], [-3, 4, 5], [-1, 4, 10], [0, 0, 0], [639, 639, 959]], np.int16),
     frozen([[0, 0, 30], [-25, 3, 31]], np.int16),
+    frozen([1, 0, 0, 1, 0], np.uint8),
 )
 SPACE_CORRECTION = Correction("alice", 5, 0, frozen([10.5, -20.25, 3.125, 0.5, 0.5, -0.5, 0.5]), 0.5)
 CORRECTION = Correction("alice", 4, 0, frozen([10.5, -20.25, 3.125]), 0.75)

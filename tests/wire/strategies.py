@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fcslam.geometry import se3
-from fcslam.geometry.voxels import voxelised
+from fcslam.geometry.voxels import to_steps, voxelised
 from fcslam.records import (
     PLACE_CHANNELS,
     Constraint,
@@ -111,8 +111,10 @@ def voxel_maps(draw, robot):
     last = draw(st.integers(first, 2**31 - 1))
     number = draw(st.integers(first, last))
     positions = hnp.arrays(np.float64, st.tuples(st.integers(1, 30), st.just(3)), elements=st.floats(-6.4, 12.7))
-    points, origins = voxelised(draw(positions)), voxelised(draw(positions))
-    return VoxelMap(KeyscanId(robot, number), first, last, draw(space_poses()), points, origins)
+    returns, origins_m = draw(positions), draw(positions)
+    scans = np.arange(len(returns)) % len(origins_m)
+    points, seen_from = voxelised(returns, scans, origins_m)
+    return VoxelMap(KeyscanId(robot, number), first, last, draw(space_poses()), points, to_steps(origins_m), seen_from)
 
 
 def tags():

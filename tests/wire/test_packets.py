@@ -50,7 +50,7 @@ def test_a_packet_counts_for_what_it_unpacks_to(sent):
     plain = 2 * len(body.ranges_m) if isinstance(body, Keyscan) else 0
     if isinstance(body, Place):
         plain = 2 * body.keypoints.size + body.descriptors.size
-    plain += 4 * len(body.points) if isinstance(body, VoxelMap) else 0
+    plain += 5 * len(body.points) if isinstance(body, VoxelMap) else 0
     assert len(data) + plain <= unpacked_size(data) <= len(data) + 1.4 * plain
     assert unpacked_size(data + b"!") == len(data) + 1
 
@@ -120,6 +120,7 @@ def test_the_largest_packets_fit():
     assert same(decode(encode(packet(keyscan))).body, keyscan)
     walls = np.random.default_rng(0).uniform((-8.0, -8.0, 0.0), (8.0, 8.0, 3.0), (100_000, 3))
     walls[:, 0] = np.round(walls[:, 0] / 2.0) * 2.0
-    local = replace(VOXEL_MAP, points=voxelised(walls))
+    points, seen_from = voxelised(walls, np.arange(len(walls)) % 2, VOXEL_MAP.origins_m)
+    local = replace(VOXEL_MAP, points=points, seen_from=seen_from)
     assert len(local.points) > 30_000
     assert same(decode(encode(packet(local))).body, local)

@@ -43,7 +43,7 @@ LONGEST = {
     "Hello.floor": 16,
     "Constraint.information": 21,
     "Keyscan.sweep": 8,
-    "VoxelMap.points": 4 * 32768,
+    "VoxelMap.points": 5 * 32768,
     "VoxelMap.origins": 3 * 256,
     "TagSighting.family": 16,
     "TagSighting.information": 6,

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.errors import PacketError
-from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2, group_of
 from fcslam.lidar.frontend import least_sigmas
 from fcslam.lidar.verification import CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Place, TagSighting, frozen
@@ -52,13 +52,15 @@ class ClaimLimits(Settings):
 def check_constraint(constraint: Constraint, largest_m: float) -> None:
     """Check a constraint, whose length is at most ``largest_m``."""
     name = f"{constraint.robot}: constraint {constraint.i} to {constraint.j}"
-    length_m = math.hypot(constraint.T_i_j[0], constraint.T_i_j[1])
+    group = group_of(constraint.T_i_j)
+    length_m = float(group.shift_m(constraint.T_i_j))
     if not length_m <= largest_m:
         raise PacketError(f"{name} is {length_m:.4g} m long, at most {largest_m:g} m")
-    x, y, theta = (constraint.information.diagonal() / _ROUNDING).tolist()
-    if max(x, y) > LEAST_SIGMA_M**-2 or theta > LEAST_SIGMA_RAD**-2:
+    claimed = (constraint.information.diagonal() / _ROUNDING).tolist()
+    position, turn = max(claimed[: group.axes]), max(claimed[group.axes :])
+    if position > LEAST_SIGMA_M**-2 or turn > LEAST_SIGMA_RAD**-2:
         raise PacketError(
-            f"{name} claims a standard deviation of {max(x, y) ** -0.5:.3g} m and {theta**-0.5:.3g} rad, at least "
+            f"{name} claims a standard deviation of {position**-0.5:.3g} m and {turn**-0.5:.3g} rad, at least "
             f"{LEAST_SIGMA_M:g} m and {LEAST_SIGMA_RAD:g} rad"
         )
 
@@ -70,28 +72,32 @@ def with_least_noise(constraint: Constraint) -> Constraint:
     the scanner's calibration (``least_sigmas``, ``CLOSURE_SIGMA_M``). So this changes only claims that are
     false.
     """
+    group, sigma_m, sigma_rad = group_of(constraint.T_i_j), CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
     if constraint.kind is ConstraintKind.ODOMETRY:
-        x, y, theta = constraint.T_i_j.tolist()
-        sigma_m, sigma_rad = least_sigmas(math.hypot(x, y), abs(theta))
-    else:
-        sigma_m, sigma_rad = CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
-    (xx, xy, xt), (_, yy, yt), (_, _, tt) = constraint.information.tolist()
-    # Without arrays: whether no eigenvalue of the information is above _ROUNDING, in units of the least noise.
-    x, y, t = (_ROUNDING - scaled for scaled in (xx * sigma_m**2, yy * sigma_m**2, tt * sigma_rad**2))
-    xy, xt, yt = xy * sigma_m**2, xt * sigma_m * sigma_rad, yt * sigma_m * sigma_rad
-    if x > 0.0:
-        second, rest = y - xy * xy / x, yt + xy * xt / x
-        if second > 0.0 and t - xt * xt / x - rest * rest / second > 0.0:
-            return constraint
-    unit = np.array((sigma_m, sigma_m, sigma_rad))
+        T = constraint.T_i_j
+        sigma_m, sigma_rad = least_sigmas(float(group.shift_m(T)), float(group.turn_rad(T)))
+    if group is SE2 and _is_no_more(constraint.information, sigma_m, sigma_rad):
+        return constraint
+    unit = group.sigmas(sigma_m, sigma_rad)
     eigenvalues, axes = np.linalg.eigh(constraint.information * np.outer(unit, unit))
     information = (axes * np.minimum(eigenvalues, 1.0)) @ axes.T / np.outer(unit, unit)
     return replace(constraint, information=frozen(0.5 * (information + information.T)))
 
 
+def _is_no_more(information: FloatArray, sigma_m: float, sigma_rad: float) -> bool:
+    """Whether no eigenvalue of the information (3, 3) is above ``_ROUNDING``, in units of the least noise."""
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = information.tolist()  # without arrays
+    x, y, t = (_ROUNDING - scaled for scaled in (xx * sigma_m**2, yy * sigma_m**2, tt * sigma_rad**2))
+    xy, xt, yt = xy * sigma_m**2, xt * sigma_m * sigma_rad, yt * sigma_m * sigma_rad
+    if x > 0.0:
+        second, rest = y - xy * xy / x, yt + xy * xt / x
+        return bool(second > 0.0 and t - xt * xt / x - rest * rest / second > 0.0)
+    return False
+
+
 def check_distance(T_odom_base: FloatArray, robot: str, limits: ClaimLimits) -> None:
-    """Check the pose (3,) of a keyscan by the robot's motions alone."""
-    distance_m = math.hypot(T_odom_base[0], T_odom_base[1])
+    """Check the pose (P,) of a keyscan by the robot's motions alone."""
+    distance_m = float(group_of(T_odom_base).shift_m(T_odom_base))
     if not distance_m <= limits.distance_m:
         raise PacketError(
             f"{robot}: is {distance_m:.4g} m off its start, at most {limits.distance_m:g} m (fleet.claims)"
@@ -107,11 +113,12 @@ def check_sighting(sighting: TagSighting) -> None:
 
 
 def check_submap(place: Place, poses: FloatArray) -> None:
-    """Check the submap of a place, whose keyscans have these poses (N, 3) by the robot's motions alone."""
+    """Check the submap of a place, whose keyscans have these poses (N, P) by the robot's motions alone."""
     name = f"{place.id.robot}: {place.channel} place {place.id.number}"
     if len(poses) > MOST_SUBMAP_KEYSCANS:
         raise PacketError(f"{name} has {len(poses)} keyscans, at most {MOST_SUBMAP_KEYSCANS}")
     anchor = poses[place.id.number - place.first]
-    reach_m = float(np.hypot(*se2.between(anchor, poses)[:, :2].T).max())
+    group = group_of(poses)
+    reach_m = float(group.shift_m(group.between(anchor, poses)).max())
     if not reach_m <= WIDEST_SUBMAP_M:
         raise PacketError(f"{name} has a keyscan {reach_m:.4g} m away, at most {WIDEST_SUBMAP_M:g} m")

@@ -65,5 +65,5 @@ class CorrectionQuality(Kept):
         return max(match.explained for match in fitting) * 0.5 * (len(fitting) + verified) / len(matches)
 
     def _fits(self, match: PlaceMatch) -> bool:
-        off = self._graph.innovation(match.i, match.j, match.T_i_j)
-        return bool(np.hypot(off[0], off[1]) <= SURPRISE_M and abs(off[2]) <= SURPRISE_RAD)
+        off_m, off_rad = self._graph.innovation(match.i, match.j, match.T_i_j)
+        return off_m <= SURPRISE_M and off_rad <= SURPRISE_RAD

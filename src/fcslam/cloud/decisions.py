@@ -18,6 +18,7 @@ from fcslam.cloud.map_comparison import GROWTH, MapComparison
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.settings import FleetConfig
+from fcslam.cloud.space import Space
 from fcslam.geometry import se2
 from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.evidence import ClusterEvidence
@@ -73,9 +74,10 @@ class ClosureDecisions(Kept):
         "_evaluated": int,
     }
 
-    def __init__(self, config: FleetConfig, sessions: SessionStore, graph: JointGraph) -> None:
+    def __init__(self, config: FleetConfig, sessions: SessionStore, graph: JointGraph, space: Space) -> None:
         self._config = config
         self._sessions = sessions
+        self._space = space
         self._graph = graph
         self.comparison = MapComparison(sessions)
         self._due: dict[frozenset[str], int] = {}
@@ -162,8 +164,8 @@ class ClosureDecisions(Kept):
         """
         for made in self._missing(final):
             i, j = self._ends(made)
-            T_i_j, information = measured(made, self._scans(i), self._scans(j))
-            self._mark(self.closures.add_by_hand(made, i, j, T_i_j, information))
+            by_walls = measured(made, self._scans(i), self._scans(j))
+            self._mark(self.closures.add_by_hand(made, i, j, *self._space.measured(i, j, *by_walls)))
         fusion = reevaluate(
             self._graph,
             self.closures,
@@ -231,9 +233,9 @@ class ClosureDecisions(Kept):
     def _scans(self, end: KeyscanId) -> Scans:
         first, last = max(end.number - REFINED_KEYSCANS, 0), end.number + REFINED_KEYSCANS
         poses, lasers = self._graph.chain(end.robot, first, last), self._sessions.lasers(end.robot)
-        base = poses[end.number - first]
+        in_plane = self._space.chain_in_plane(end, poses[end.number - first], poses)
         keyscans = self._sessions.keyscans(end.robot, first, first + len(poses) - 1)
-        return [(keyscan_points(k, lasers), se2.between(base, poses[k.id.number - first])) for k in keyscans]
+        return [(keyscan_points(k, lasers), in_plane[k.id.number - first]) for k in keyscans]
 
     def _accept_if_consistent(self, entry: ClosureEntry) -> bool:
         """Accept a verified closure that fits the joint map; False if only a cluster may accept it."""
@@ -241,9 +243,8 @@ class ClosureDecisions(Kept):
         if closure.status is not ClosureStatus.VERIFIED:
             return True
         if closure.i.robot in self.map_of(closure.j.robot):
-            off = self._graph.innovation(closure.i, closure.j, closure.T_i_j)
-            off_m = float(np.hypot(off[0], off[1]))
-            if off_m < SURPRISE_M and abs(off[2]) < SURPRISE_RAD:
+            off_m, off_rad = self._graph.innovation(closure.i, closure.j, closure.T_i_j)
+            if off_m < SURPRISE_M and off_rad < SURPRISE_RAD:
                 fits = Reason(ReasonCode.FITS_JOINT_MAP, off_m, SURPRISE_M)
                 self._accept(entry, fits)
                 return True
@@ -297,8 +298,8 @@ class ClosureDecisions(Kept):
         if not decision.contested or decision.shortfall is not None:
             return decision.contested
         members = [entries[k].closure for k in decision.members]
-        off = np.array([self._graph.innovation(closure.i, closure.j, closure.T_i_j) for closure in members])
-        return bool(2 * np.count_nonzero(np.hypot(off[:, 0], off[:, 1]) > SURPRISE_M) > len(off))
+        off_m = [self._graph.innovation(closure.i, closure.j, closure.T_i_j)[0] for closure in members]
+        return 2 * sum(off > SURPRISE_M for off in off_m) > len(off_m)
 
 
 def _separated(before: Sequence[Sequence[str]], after: Sequence[Sequence[str]]) -> list[tuple[list[str], list[str]]]:

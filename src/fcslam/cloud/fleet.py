@@ -22,6 +22,7 @@ from fcslam.cloud.rigid_fusion import fuse_rigidly
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import in_session
 from fcslam.cloud.settings import FleetConfig, FusionStrategy
+from fcslam.cloud.space import Space
 from fcslam.cloud.tags import SeenTags
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
@@ -38,6 +39,7 @@ from fcslam.records import (
     ManualClosure,
     Place,
     TagSighting,
+    VoxelMap,
     frozen,
 )
 from fcslam.storage.state_file import State
@@ -63,10 +65,11 @@ class Fleet:
         self._verify_pairs = verify_pairs
         self._seed = seed
         self._sessions = SessionStore(config.claims, read)
-        self._graph = JointGraph()
-        self._decisions = ClosureDecisions(config, self._sessions, self._graph)
+        self._graph = JointGraph(config.group)
+        self._space = Space(config.group, self._sessions)
+        self._decisions = ClosureDecisions(config, self._sessions, self._graph, self._space)
         self._recognition = PlaceRecognition(
-            config, seed, self._sessions, self._graph, self._decisions.closures, verify_pairs
+            config, seed, self._sessions, self._graph, self._space, self._decisions.closures, verify_pairs
         )
         self._tags = SeenTags(self._sessions, self._graph)
         self._quality = CorrectionQuality(self._graph)
@@ -92,10 +95,12 @@ class Fleet:
                 self._sessions.add_hello(hello, packet.sequence)
             case Keyscan() as keyscan:
                 self._add_keyscan(keyscan, packet.sequence)
-            case Constraint(kind=ConstraintKind.ODOMETRY) as motion:
+            case Constraint(kind=ConstraintKind.ODOMETRY):
+                motion = self._space.constraint(packet.body)
                 self._sessions.add_motion(motion)
                 self._graph.extend(with_least_noise(motion))
-            case Constraint() as closure:
+            case Constraint():
+                closure = self._space.constraint(packet.body)
                 self._sessions.require(KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j))
                 check_constraint(closure, LONGEST_CLOSURE_M)
                 self._decisions.add_local(with_least_noise(closure))
@@ -107,6 +112,8 @@ class Fleet:
                 self._add_sighting(sighting)
             case KeyscanFix() as fix:
                 self._sessions.add_fix(fix)
+            case VoxelMap() as voxels:
+                self._sessions.add_voxel_map(voxels, packet.sequence)
             case Correction() | Acknowledgement() | DetectorUpdate():
                 raise PacketError(f"{packet.robot}: a {type(packet.body).__name__} goes to a robot, not to the cloud")
 
@@ -188,9 +195,9 @@ class Fleet:
 
     def conclude(self) -> FleetResult:
         """Decide every closure from all evidence and collect the result; the fleet stays as it is."""
-        graph = JointGraph()
+        graph = JointGraph(self._graph.group)
         graph.restore(self._graph.state())
-        decisions = ClosureDecisions(self._config, self._sessions, graph)
+        decisions = ClosureDecisions(self._config, self._sessions, graph, self._space)
         decisions.changes = self._decisions.changes
         for name in ("closures", "comparison"):
             getattr(decisions, name).restore(getattr(self._decisions, name).state())
@@ -274,8 +281,9 @@ class Fleet:
             members = next(robots for robots in rigid.maps if session in robots)
             pose_of = rigid.pose
             T_map_odom = self._graph.T_map_odom(session, rigid.T_map_base[session][-1])
-        T = T_placed_map(members, self._sessions, pose_of, changes)
-        T_map_odom = frozen(T_map_odom if T is None else se2.compose(T, T_map_odom))
+        group = self._graph.group
+        T = T_placed_map(members, self._sessions, lambda keyscan: group.to_plane(pose_of(keyscan)), changes)
+        T_map_odom = frozen(T_map_odom if T is None else group.compose(group.from_plane(T), T_map_odom))
         return Correction(session, self._decisions.version, indices[session], T_map_odom, quality)
 
     def _add_keyscan(self, keyscan: Keyscan, sequence: int) -> None:
@@ -286,7 +294,7 @@ class Fleet:
 
     def _add_sighting(self, sighting: TagSighting) -> None:
         session = sighting.id.robot
-        matches = self._tags.add(sighting)
+        matches = [self._space.match(match) for match in self._tags.add(sighting)]
         for match in matches:
             if match.i.robot == session:
                 constraint = Constraint(

@@ -13,6 +13,7 @@ from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.sessions import robot_of
+from fcslam.geometry.groups import Group
 from fcslam.graph import cluster
 from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.consistency import Closures
@@ -39,19 +40,19 @@ def decide_join(
 ) -> ClusterDecision:
     """The dominant cluster among the closures of two robots, by the current estimate of their trajectories."""
     a, b = (graph.path(robot) for robot in robots)
-    informative, closures = [entry.closure.informative for entry in entries], _closures(entries, robots[0])
+    informative, closures = [entry.closure.informative for entry in entries], _closures(entries, robots[0], graph.group)
     return cluster.decide_cluster(
         a, b, closures, informative, settings, lambda members: examine(robots, a, b, closures.select(members))
     )
 
 
-def _closures(entries: Sequence[ClosureEntry], robot_a: str) -> Closures:
+def _closures(entries: Sequence[ClosureEntry], robot_a: str, group: Group) -> Closures:
     found = [entry.closure for entry in entries]
     closures = Closures(
         np.array([closure.i.number for closure in found], dtype=np.int64),
         np.array([closure.j.number for closure in found], dtype=np.int64),
-        np.array([closure.T_i_j for closure in found]).reshape(-1, 3),
-        np.array([closure.information for closure in found]).reshape(-1, 3, 3),
+        np.array([closure.T_i_j for closure in found]).reshape(-1, group.size),
+        np.array([closure.information for closure in found]).reshape(-1, group.freedom, group.freedom),
         _tag_numbers(entries),
     )
     return closures.reversed(np.array([closure.i.robot != robot_a for closure in found], dtype=bool))

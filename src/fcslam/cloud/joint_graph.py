@@ -6,7 +6,7 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2, Group
 from fcslam.graph.least_squares import Loss
 from fcslam.graph.optimizer import optimize
 from fcslam.graph.pose_graph import Edge, EdgeArrays, PoseGraph, Rows
@@ -25,12 +25,13 @@ SOLVED_SHARE = 0.05
 class JointGraph:
     """Grows with the packets; poses of robots in different maps are each in their own map's frame."""
 
-    def __init__(self) -> None:
-        self.graph = PoseGraph()
+    def __init__(self, group: Group = SE2) -> None:
+        self.group = group
+        self.graph = PoseGraph(group=group)
         self._variables: dict[str, Rows[np.int64]] = {}
         self._chains: dict[str, Rows[np.float64]] = {}
         self._step_covariance: dict[str, Rows[np.float64]] = {}
-        self._poses = Rows(np.zeros((0, 3)))
+        self._poses = Rows(np.zeros((0, group.size)))
         self._left_out: set[int] = set()
         self._closures = self._unsolved = 0
         """Closures in the graph, and those that came in since the last solve."""
@@ -42,18 +43,18 @@ class JointGraph:
         return int(self._variables[keyscan.robot].values[keyscan.number])
 
     def pose(self, keyscan: KeyscanId) -> FloatArray:
-        """T_map_base (3,) of the keyscan in its robot's current map."""
+        """T_map_base (P,) of the keyscan in its robot's current map."""
         pose: FloatArray = self._poses.values[self.variable(keyscan)]
         return pose
 
     def poses(self, keyscans: Iterable[KeyscanId]) -> FloatArray:
-        """T_map_base of the keyscans, each in its robot's current map, shape (N, 3)."""
+        """T_map_base of the keyscans, each in its robot's current map, shape (N, P)."""
         variables = [self._variables[robot].values[number] for robot, number in keyscans]
-        poses: FloatArray = self._poses.values[variables].reshape(-1, 3)
+        poses: FloatArray = self._poses.values[variables].reshape(-1, self.group.size)
         return poses
 
     def trajectory(self, robot: str, numbers: NDArray[np.int64] | None = None) -> FloatArray:
-        """T_map_base of the robot's keyscans, or of those with these numbers (N,), shape (N, 3)."""
+        """T_map_base of the robot's keyscans, or of those with these numbers (N,), shape (N, P)."""
         variables = self._variables[robot].values
         trajectory: FloatArray = self._poses.values[variables if numbers is None else variables[numbers]]
         return trajectory
@@ -63,40 +64,40 @@ class JointGraph:
         return build_trajectory(self.trajectory(robot), self._step_covariance[robot].values)
 
     def chain(self, robot: str, first: int = 0, last: int | None = None) -> FloatArray:
-        """T_odom_base (N, 3) of keyscans first to last (inclusive), by the robot's motions without any closure."""
+        """T_odom_base (N, P) of keyscans first to last (inclusive), by the robot's motions without any closure."""
         end = None if last is None else last + 1
         return self._chains[robot].values[first:end].copy()
 
     def travel_since(self, robot: str) -> FloatArray:
         """Way in metres from each keyscan of the robot to its newest one by its motions, shape (N,)."""
-        steps = np.diff(self._chains[robot].values[:, :2], axis=0)
-        travel_m = np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
+        steps = np.diff(self._chains[robot].values, axis=0)
+        travel_m = np.concatenate(([0.0], np.cumsum(self.group.shift_m(steps))))
         since_m: FloatArray = travel_m[-1] - travel_m
         return since_m
 
     def T_map_odom(self, robot: str, T_map_newest: FloatArray | None = None) -> FloatArray:
         """Where the robot's odometry (the chain of its motions) starts in the map, by its newest keyscan.
 
-        ``T_map_newest`` (3,) says where that is, by default where it is estimated now.
+        ``T_map_newest`` (P,) says where that is, by default where it is estimated now.
         """
         newest = self._poses.values[self._variables[robot].values[-1]]
         T_map_base = newest if T_map_newest is None else T_map_newest
-        return se2.compose(T_map_base, se2.inverse(self._chains[robot].values[-1]))
+        return self.group.compose(T_map_base, self.group.inverse(self._chains[robot].values[-1]))
 
     def start(self, robot: str) -> None:
         """First keyscan of a robot: the origin of a map of its own."""
-        self._chains[robot] = Rows(np.zeros((1, 3)))
-        self._step_covariance[robot] = Rows(np.zeros((0, 3, 3)))
-        self._variables[robot] = Rows(np.array([self._add_variable(np.zeros(3))]))
+        self._chains[robot] = Rows(self.group.identity[None])
+        self._step_covariance[robot] = Rows(np.zeros((0, self.group.freedom, self.group.freedom)))
+        self._variables[robot] = Rows(np.array([self._add_variable(self.group.identity)]))
 
     def extend(self, constraint: Constraint) -> None:
         """A robot's motion to its next keyscan."""
         robot = constraint.robot
         previous = int(self._variables[robot].values[-1])
-        variable = self._add_variable(se2.compose(self._poses.values[previous], constraint.T_i_j))
+        variable = self._add_variable(self.group.compose(self._poses.values[previous], constraint.T_i_j))
         self._variables[robot].append(variable)
         self._step_covariance[robot].append(np.linalg.inv(constraint.information))
-        self._chains[robot].append(se2.compose(self._chains[robot].values[-1], constraint.T_i_j))
+        self._chains[robot].append(self.group.compose(self._chains[robot].values[-1], constraint.T_i_j))
         self.graph.add_edge(Edge(previous, variable, constraint.T_i_j, constraint.information, robust=False))
 
     def close(self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray, information: FloatArray) -> int:
@@ -107,9 +108,10 @@ class JointGraph:
         self._changed.add(edge)
         return edge
 
-    def innovation(self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray) -> FloatArray:
-        """Difference of a measurement T_i_j (3,) and the estimate: (x, y, theta), in metres and radians."""
-        return se2.between(se2.between(self.pose(i), self.pose(j)), T_i_j)
+    def innovation(self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray) -> tuple[float, float]:
+        """Difference of a measurement T_i_j (P,) and the estimate, in metres and radians."""
+        off = self.group.between(self.group.between(self.pose(i), self.pose(j)), T_i_j)
+        return float(self.group.shift_m(off)), float(self.group.turn_rad(off))
 
     def is_due(self, closures: int) -> bool:
         """Whether that many closures came in since the last solve, and the graph has grown noticeably.
@@ -132,17 +134,17 @@ class JointGraph:
         self.take(poses)
 
     def take(self, poses: FloatArray) -> None:
-        """Replace the estimate by a solution, shape (N, 3)."""
+        """Replace the estimate by a solution, shape (N, P)."""
         self._poses.values[: len(poses)] = poses
         self._unsolved = 0
         self._changed.clear()
 
     def held(self, T_map_base: Mapping[str, FloatArray], left_out: Container[int | None]) -> PoseGraph:
-        """These robots at poses (N, 3), with the constraints that are not left out: the graph of a finished run.
+        """These robots at poses (N, P), with the constraints that are not left out: the graph of a finished run.
 
         No constraint that connects one of them with another robot is kept.
         """
-        kept, poses = np.zeros(len(self.graph), bool), np.zeros((len(self.graph), 3))
+        kept, poses = np.zeros(len(self.graph), bool), np.zeros((len(self.graph), self.group.size))
         for robot, T_robot in T_map_base.items():
             variables = self._variables[robot].values
             poses[variables], kept[variables] = T_robot, True

@@ -8,6 +8,7 @@ import numpy as np
 from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD
 from fcslam.cloud.session_store import SessionStore
 from fcslam.geometry import se2
+from fcslam.geometry.groups import group_of
 from fcslam.graph.cluster import local_frames, relative_frame
 from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import LEAD, MapFit, refutation
@@ -66,7 +67,7 @@ class MapComparison(Kept):
         the places. An earlier comparison at the same transform counts until the cluster or the paths have grown by a
         factor, if the maps agreed clearly until the paths have, and for good if keyscans were released since.
         """
-        pair = frozenset(sessions)
+        a, b, members, pair = a.to_plane(), b.to_plane(), members.to_plane(), frozenset(sessions)
         T_a_b, size = relative_frame(a, b, members), len(a) + len(b)
         earlier = [each for each in self._compared.get(pair, ()) if self._is_at(each, a, b, T_a_b)]
         is_clear = bool(earlier) and earlier[0].agrees and earlier[0].fit.ratio >= LEAD
@@ -133,7 +134,9 @@ class MapComparison(Kept):
         return _Compared(i, j, frozen(T_i_j), keyscans, len(members), len(a) + len(b), fit)
 
     def at(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> MapFit:
-        """Compare the maps of two sessions at poses (N, 3) of their keyscans in the frame of one map."""
+        """Compare the maps of two sessions at poses (N, P) of their keyscans in the frame of one map."""
+        in_plane = group_of(poses_a).to_plane
+        poses_a, poses_b = in_plane(poses_a), in_plane(poses_b)
         return _fit(self._local_maps(sessions, poses_a, poses_b).agreement(np.zeros_like(poses_b)))
 
     def _local_maps(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> LocalMaps:

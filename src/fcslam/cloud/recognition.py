@@ -12,6 +12,7 @@ from fcslam.cloud.joint_graph import AGREES_SIGMAS, JointGraph
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.sessions import robot_of
 from fcslam.cloud.settings import FleetConfig
+from fcslam.cloud.space import Space
 from fcslam.cloud.submaps import SubmapCache
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import places_of_old_sessions, surplus_places
@@ -62,6 +63,7 @@ class PlaceRecognition:
         seed: int,
         sessions: SessionStore,
         graph: JointGraph,
+        space: Space,
         closures: ClosureLog,
         verify_pairs: VerifyPairs,
     ) -> None:
@@ -69,9 +71,10 @@ class PlaceRecognition:
         self._seed = seed
         self._sessions = sessions
         self._graph = graph
+        self._space = space
         self._closures = closures
         self._verify_pairs = verify_pairs
-        self.submaps = SubmapCache(sessions, graph, config.submaps_kept)
+        self.submaps = SubmapCache(sessions, graph, space, config.submaps_kept)
         self._matchers: dict[_VocabularyKey, PlaceMatcher] = {}
         self._places: dict[tuple[_VocabularyKey, str], NDArray[np.int64]] = {}
         """Number of the keyscan and of the arrival of each stored place, shape (N, 2), by vocabulary and session."""
@@ -91,7 +94,8 @@ class PlaceRecognition:
         self._enter(key, place.id)
         verified = {match.i for match in matches if match.M}
         at_start = {match.i: match for match in by_start if match.i not in verified}
-        return [*(match for match in matches if match.i not in at_start), *at_start.values()]
+        found = (*(match for match in matches if match.i not in at_start), *at_start.values())
+        return [self._space.match(match) for match in found]
 
     def match_again(self, a: Collection[str], b: Collection[str]) -> Iterator[tuple[str, list[PlaceMatch]]]:
         """Compare the places of two groups of sessions, which shared a map until now, wherever they were not compared.
@@ -104,7 +108,7 @@ class PlaceRecognition:
             others = [KeyscanId(session, number) for session in a for number in stored[session]]
             for place in [KeyscanId(session, number) for session in b for number in stored[session]]:
                 new = [i for i in others if not self._closures.has(i, place, key[0])]
-                yield place.robot, matcher.match_again(place, new)
+                yield place.robot, [self._space.match(match) for match in matcher.match_again(place, new)]
 
     def thin(self, place: Place, map_sessions: Collection[str]) -> None:
         """Forget the oldest places of the robot in one map where it has very many, and those of its old sessions."""
@@ -188,7 +192,9 @@ class PlaceRecognition:
             if found:
                 visits.setdefault(robot_of(session), []).extend(found)
         chosen = worth_comparing(visits.values(), NEAR_VISITS, COMPARED_VISITS)
-        return {visit.nearest: se2.between(self._graph.pose(visit.nearest), pose) for visit in chosen}
+        group = self._graph.group
+        T_i_j = {visit.nearest: group.between(self._graph.pose(visit.nearest), pose) for visit in chosen}
+        return {i: self._space.in_plane(T, i, place.id) for i, T in T_i_j.items()}
 
     def _by_start(self, place: Place, map_sessions: Collection[str]) -> Iterator[PlaceMatch]:
         """Matches with places of other maps that agree with the known starts.
@@ -217,7 +223,7 @@ class PlaceRecognition:
                     yield match
 
     def _from_start(self, session: str, numbers: NDArray[np.int64]) -> FloatArray:
-        poses = self._graph.trajectory(session)
+        poses = self._graph.group.to_plane(self._graph.trajectory(session))
         return se2.between(poses[0], poses[numbers])
 
 

@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from fcslam.geometry.groups import group_of
 from fcslam.records import Channel, Correction, DetectorFile
 from fcslam.wire.messages import Acknowledgement, Body, DetectorUpdate, Packet
 
@@ -63,7 +64,8 @@ def is_news(old: Correction | None, new: Correction) -> bool:
     """Whether a robot that has ``old`` is to get ``new``; whether the correction is supported is always news."""
     if old is None or old.map_index != new.map_index:
         return True
-    x, y, theta = np.abs(old.T_map_odom - new.T_map_odom)
-    turned = min(theta, 2.0 * np.pi - theta)
+    group = group_of(new.T_map_odom)
+    moved = np.abs(old.T_map_odom[: group.axes] - new.T_map_odom[: group.axes]).max()
+    turned = group.turn_rad(group.between(old.T_map_odom, new.T_map_odom))
     changed = abs(old.quality - new.quality) >= NEWS_QUALITY or (old.quality == 0.0) != (new.quality == 0.0)
-    return bool(max(x, y) >= NEWS_M or turned >= NEWS_RAD or changed)
+    return bool(moved >= NEWS_M or turned >= NEWS_RAD or changed)

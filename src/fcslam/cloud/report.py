@@ -11,15 +11,16 @@ from numpy.typing import NDArray
 from fcslam.cloud.placement import region_files, with_regions
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.cloud.sessions import robot_of
-from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2, group_of
 from fcslam.graph.evidence import ClusterEvidence
 from fcslam.graph.g2o import g2o_text
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.drawing import picture
 from fcslam.maps.fusion import fuse
+from fcslam.maps.joint_voxels import ply_of
 from fcslam.maps.occupancy_map import OccupancyMap, map_stem, map_yaml, pgm_bytes, server_files
 from fcslam.processes import trim_memory
-from fcslam.records import PLACE_CHANNELS, ClosureStatus, FloatArray, LoopClosure, frozen
+from fcslam.records import PLACE_CHANNELS, ClosureStatus, FloatArray, LoopClosure, VoxelMap, frozen
 from fcslam.runs import ClosureRow, Join, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
@@ -38,11 +39,16 @@ class Track:
     keyscans: NDArray[np.int64]
     """Number of each scan's keyscan, shape (N,)."""
     T_keyscan_base: FloatArray
-    """Pose of each scan in its keyscan's base, shape (N, 3)."""
+    """Pose of each scan in its keyscan's base, shape (N, 3), or (N, 7) of a robot in space."""
 
     def on_keyscans(self, T_keyscans: FloatArray) -> FloatArray:
-        """Poses (N, 3) of all scans, given the poses (K, 3) of the keyscans."""
-        return se2.compose(T_keyscans[self.keyscans], self.T_keyscan_base)
+        """Poses (N, P) of all scans, given the poses (K, P) of the keyscans."""
+        group, offsets = group_of(T_keyscans), self.T_keyscan_base
+        if group is SE2:
+            offsets = group_of(offsets).to_plane(offsets)
+        elif group_of(offsets) is SE2:
+            offsets = group.from_plane(offsets)
+        return group.compose(T_keyscans[self.keyscans], offsets)
 
 
 def keyscan_track(robot: MappedRobot) -> Track:
@@ -70,13 +76,14 @@ def run_of(
             frozen(track.stamps),
             frozen(track.on_keyscans(mapped[name].T_map_base)),
             mapped[name].floor,
+            None if (space := mapped[name].space) is None else frozen(track.on_keyscans(space.T_map_base)),
         )
         for name, track in tracks.items()
     }
     fused = dict(fused_maps(result, grid))
     certificates = _certificates(result, fused) if with_certificates else {}
     trim_memory()  # dense covariances and pictures are large, and need not be there at the same time
-    map_files = _map_files(result, trajectories, fused)
+    map_files = _map_files(result, trajectories, fused) | _space_files(result)
     trim_memory()
     if with_local_maps and 0 in certificates:  # a live run has it by turns
         metrics = [*metrics, Metric("map_error_95", certificates[0]["error_95"], "m")]
@@ -86,7 +93,7 @@ def run_of(
         joins=tuple(_join(pair, evidence) for pair, evidence in result.joins.items()),
         metrics={metric.name: metric for metric in (*_counts(result), *metrics)},
         config_yaml=config_yaml,
-        pose_graph_g2o=g2o_text(result.graph, _ids([mapped[name] for name in sorted(tracks)])),
+        pose_graph_g2o=g2o_text(result.space_graph or result.graph, _ids([mapped[name] for name in sorted(tracks)])),
         map_files=map_files,
         local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
         quality=_quality(certificates, fused),
@@ -167,7 +174,7 @@ def _closure_row(closure: LoopClosure, mapped: dict[str, MappedRobot]) -> Closur
         float(mapped[j.robot].stamps[j.number]),
         closure.channel,
         closure.similarity,
-        closure.T_i_j,
+        group_of(closure.T_i_j).to_plane(closure.T_i_j),
         closure.status,
         closure.reason,
     )
@@ -186,6 +193,16 @@ def _map_files(
             ways = {name: robot.T_map_base for name, robot in trajectories.items() if name in keyscans}
             files[f"{stem}.png"] = picture(fused, ways, result.closures, keyscans)
     return files
+
+
+def _space_files(result: FleetResult) -> dict[str, bytes]:
+    """The voxel maps of robots in space, by map."""
+    by_map: dict[int, list[tuple[VoxelMap, FloatArray]]] = {}
+    for robot in result.robots:
+        if robot.space is not None:
+            placed = ((voxels, robot.space.T_map_base[voxels.id.number]) for voxels in robot.space.voxel_maps)
+            by_map.setdefault(robot.map_index, []).extend(placed)
+    return {f"{map_stem(k)}.ply": ply_of(placed) for k, placed in by_map.items() if placed}
 
 
 def _certificates(result: FleetResult, maps: Mapping[int, OccupancyMap]) -> dict[int, dict[str, Any]]:

@@ -11,7 +11,7 @@ from fcslam.cloud.edits import is_cut
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.placement import PlacedRegion, T_placed_map, placed_regions
 from fcslam.cloud.session_store import SessionStore
-from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2, Group
 from fcslam.graph.evidence import ClusterEvidence
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import (
@@ -25,8 +25,20 @@ from fcslam.records import (
     LaserModel,
     LoopClosure,
     TagSighting,
+    VoxelMap,
     frozen,
 )
+
+
+@dataclass(frozen=True, slots=True)
+class SpacePath:
+    """A robot's path in space, and what it saw there."""
+
+    T_map_base: FloatArray
+    """Pose at each stamp, in the frame of its map, shape (N, 7)."""
+    T_local_base: FloatArray
+    """Pose at each stamp, in the robot's own map, shape (N, 7)."""
+    voxel_maps: tuple[VoxelMap, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +65,8 @@ class MappedRobot:
     """Floor that the session named; empty: none."""
     fixes: tuple[KeyscanFix, ...] = ()
     """Fixes of satellite navigation at its keyscans."""
+    space: "SpacePath | None" = None
+    """Its poses with six degrees of freedom; None in the plane."""
 
     def numbers(self) -> NDArray[np.int64]:
         """Rows of ``keyscans`` in stamps and poses, ascending."""
@@ -68,13 +82,15 @@ class FleetResult:
     """Between robots and within them."""
     corrections: tuple[Correction, ...]
     graph: PoseGraph
-    """All keyscans at their optimized poses, with the accepted constraints."""
+    """All keyscans at their optimized poses, with the accepted constraints; of a fleet in space its projection."""
     regions: tuple[PlacedRegion, ...] = ()
     """Regions that users drew in the maps."""
     joins: Mapping[frozenset[str], ClusterEvidence] = field(default_factory=dict)
     """On what evidence two robots share a map, where closures between them agree."""
     sightings: tuple[TagSighting, ...] = ()
     """Of the tags that the robots saw."""
+    space_graph: PoseGraph | None = None
+    """The pose graph in space."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,16 +100,16 @@ class Fusion:
     maps: Sequence[Sequence[str]]
     """Robots of each map, maps and robots in the order in which they started."""
     T_map_base: Mapping[str, FloatArray]
-    """Every robot's keyscans in the frame of its map, shape (N, 3)."""
+    """Every robot's keyscans in the frame of its map, shape (N, P)."""
     T_local_base: Mapping[str, FloatArray]
-    """Every robot's keyscans in its own map, shape (N, 3)."""
+    """Every robot's keyscans in its own map, shape (N, P)."""
     closures: tuple[LoopClosure, ...]
     """In the order in which they were found, decided."""
     joins: Mapping[frozenset[str], ClusterEvidence] = field(default_factory=dict)
     """As in ``FleetResult``."""
 
     def pose(self, keyscan: KeyscanId) -> FloatArray:
-        """Pose of a keyscan in its map, shape (3,)."""
+        """Pose of a keyscan in its map, shape (P,)."""
         pose: FloatArray = self.T_map_base[keyscan.robot][keyscan.number]
         return pose
 
@@ -116,7 +132,8 @@ def conclude(
 
     ``changes`` are the edits in force; those of closures were taken into account before.
     """
-    fusion = _placed(fusion, sessions, changes)
+    group = graph.group
+    fusion = _placed(fusion, sessions, changes, group)
     index = map_indices(fusion.maps)
     names = [robot for robot in sessions.robots if robot in index]
     variables = graph.held_variables(fusion.T_map_base)
@@ -126,12 +143,13 @@ def conclude(
             index[robot],
             frozen(sessions.stamps(robot)),
             tuple(k for k in sessions.keyscans(robot) if not is_cut(robot, k.stamp, changes)),
-            fusion.T_map_base[robot],
-            fusion.T_local_base[robot],
+            frozen(group.to_plane(fusion.T_map_base[robot])),
+            frozen(group.to_plane(fusion.T_local_base[robot])),
             frozen(variables[robot], np.int64),
             sessions.lasers(robot),
             sessions.floor(robot),
             tuple(fix for fix in sessions.fixes(robot) if not is_cut(robot, sessions.stamp(fix.id), changes)),
+            None if group is SE2 else _space_path(robot, sessions, fusion, changes),
         )
         for robot in names
     )
@@ -144,15 +162,26 @@ def conclude(
         for entry, closure in zip(closures, fusion.closures, strict=True)
         if closure.status is not ClosureStatus.ACCEPTED
     }
-    regions = placed_regions(index, sessions, fusion.pose, changes)
+    regions = placed_regions(index, sessions, lambda keyscan: group.to_plane(fusion.pose(keyscan)), changes)
     held = graph.held(fusion.T_map_base, left_out)
-    return FleetResult(robots, fusion.closures, corrections, held, regions, joins=fusion.joins)
+    space_graph = None if group is SE2 else held
+    return FleetResult(
+        robots, fusion.closures, corrections, held.to_plane(), regions, fusion.joins, space_graph=space_graph
+    )
 
 
-def _placed(fusion: Fusion, sessions: SessionStore, changes: Sequence[Change]) -> Fusion:
+def _space_path(robot: str, sessions: SessionStore, fusion: Fusion, changes: Sequence[Change]) -> SpacePath:
+    kept = tuple(
+        voxels for voxels in sessions.voxel_maps(robot) if not is_cut(robot, sessions.stamp(voxels.id), changes)
+    )
+    return SpacePath(fusion.T_map_base[robot], fusion.T_local_base[robot], kept)
+
+
+def _placed(fusion: Fusion, sessions: SessionStore, changes: Sequence[Change], group: Group) -> Fusion:
     T_map_base = dict(fusion.T_map_base)
     for members in fusion.maps:
-        T = T_placed_map(members, sessions, fusion.pose, changes)
+        T = T_placed_map(members, sessions, lambda keyscan: group.to_plane(fusion.pose(keyscan)), changes)
         if T is not None:
-            T_map_base |= {session: frozen(se2.compose(T, T_map_base[session])) for session in members}
+            T = group.from_plane(T)
+            T_map_base |= {session: frozen(group.compose(T, T_map_base[session])) for session in members}
     return replace(fusion, T_map_base=T_map_base)

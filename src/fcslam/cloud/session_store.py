@@ -10,8 +10,8 @@ from fcslam.cloud.claims import LONGEST_MOTION_M, ClaimLimits, check_constraint,
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.sessions import in_session
 from fcslam.errors import PacketError
-from fcslam.geometry import se2
 from fcslam.geometry.beams import misfit
+from fcslam.geometry.groups import group_of
 from fcslam.records import (
     Channel,
     Constraint,
@@ -21,12 +21,13 @@ from fcslam.records import (
     KeyscanId,
     LaserModel,
     Place,
+    VoxelMap,
 )
 from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Hello, Packet
 
-_Body = TypeVar("_Body", Hello, Keyscan)
+_Body = TypeVar("_Body", Hello, Keyscan, VoxelMap)
 
 
 @dataclass(slots=True)
@@ -52,13 +53,15 @@ class _Session:
     connected: int = 0
     """How many keyscans are connected to the first one by motions; only these are used."""
     T_odom_base: FloatArray | None = None
-    """Pose of the newest connected keyscan, by the motions alone, shape (3,)."""
+    """Pose of the newest connected keyscan, by the motions alone, shape (P,)."""
     places: set[tuple[int, Channel, str]] = field(default_factory=set)
     """Keyscan, channel and detector version of every place."""
     spans: dict[tuple[int, Channel], tuple[int, int]] = field(default_factory=dict)
     """First and last keyscan behind the places at a keyscan, whichever detector described them."""
     fixes: dict[int, KeyscanFix] = field(default_factory=dict)
     """Of satellite navigation, by keyscan."""
+    voxel_maps: dict[int, int] = field(default_factory=dict)
+    """Numbers of the packets of voxel maps, by keyscan."""
 
 
 _KEPT: dict[str, Any] = {
@@ -68,6 +71,7 @@ _KEPT: dict[str, Any] = {
     "places": set[tuple[int, Channel, str]],
     "spans": dict[tuple[int, Channel], tuple[int, int]],
     "fixes": dict[int, KeyscanFix],
+    "voxel_maps": dict[int, int],
 }
 """What a state has of each session as it is."""
 
@@ -86,6 +90,8 @@ class SessionStore:
         """Those that users gave to sessions."""
         self._sessions: dict[str, _Session] = {}
         """By name; those with a keyscan in the order of their first."""
+        self._voxel_maps: dict[KeyscanId, VoxelMap] = {}
+        """Those that were read."""
         self._unread: list[KeyscanId] = []
         """Keyscans that ``restore`` named; some may have been read since."""
 
@@ -133,7 +139,7 @@ class SessionStore:
             raise PacketError(f"{robot}: motion {motion.i} to {motion.j} does not lead to a new keyscan")
         check_constraint(motion, LONGEST_MOTION_M)
         before = session.T_odom_base
-        T_odom_base = motion.T_i_j if before is None else se2.compose(before, motion.T_i_j)
+        T_odom_base = motion.T_i_j if before is None else group_of(before).compose(before, motion.T_i_j)
         check_distance(T_odom_base, robot, self._limits)
         session.T_odom_base, session.connected = T_odom_base, new + 1
 
@@ -163,6 +169,29 @@ class SessionStore:
         if number in fixes:
             raise PacketError(f"{robot}: keyscan {number} has a fix already")
         fixes[number] = fix
+
+    def add_voxel_map(self, voxels: VoxelMap, sequence: int) -> None:
+        """The surfaces around a keyscan; ``sequence`` is the number of its packet."""
+        robot, number = voxels.id
+        self.require(voxels.id, KeyscanId(robot, voxels.last))
+        if number in self._sessions[robot].voxel_maps:
+            raise PacketError(f"{robot}: keyscan {number} has a voxel map already")
+        self._sessions[robot].voxel_maps[number] = sequence
+        self._voxel_maps[voxels.id] = voxels
+
+    def voxel_map(self, keyscan: KeyscanId) -> VoxelMap | None:
+        """The voxel map around a keyscan; None if its robot sent none."""
+        sequence = self._sessions[keyscan.robot].voxel_maps.get(keyscan.number)
+        if sequence is None:
+            return None
+        if keyscan not in self._voxel_maps:
+            self._voxel_maps[keyscan] = self._stored(PacketNumber(keyscan.robot, sequence), VoxelMap)
+        return self._voxel_maps[keyscan]
+
+    def voxel_maps(self, robot: str) -> tuple[VoxelMap, ...]:
+        """The voxel maps of the robot, by keyscan."""
+        found = (self.voxel_map(KeyscanId(robot, number)) for number in sorted(self._sessions[robot].voxel_maps))
+        return tuple(voxels for voxels in found if voxels is not None)
 
     def fixes(self, robot: str) -> tuple[KeyscanFix, ...]:
         """The fixes of satellite navigation of the robot."""

@@ -7,6 +7,7 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from fcslam.cloud.claims import ClaimLimits
 from fcslam.config import Settings
+from fcslam.geometry.groups import SE2, SE3, Group
 from fcslam.graph.evidence import ConsistencySettings
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.places.matcher import MatchDecision, MatcherConfig
@@ -30,6 +31,9 @@ class FleetConfig(Settings):
     fusion: FusionStrategy = Field(
         default=FusionStrategy.JOINT,
         description="how maps are fused: joint (one robust graph), or two_point (rigid maps, as in the paper)",
+    )
+    dimensions: int = Field(
+        default=2, ge=2, le=3, description="3: poses in space, for robots with 3D LiDARs (--3d); 2: in the plane"
     )
     solve_every: int = Field(
         default=40,
@@ -62,7 +66,14 @@ class FleetConfig(Settings):
                 "matcher.decision similarity measures no transform, which the joint graph needs; "
                 "set fusion to two_point"
             )
+        if self.dimensions == 3 and self.fusion is not FusionStrategy.JOINT:
+            raise ValueError("fusion two_point aligns maps in the plane; set dimensions to 2")
         return self
+
+    @property
+    def group(self) -> Group:
+        """Of the poses."""
+        return SE2 if self.dimensions == 2 else SE3
 
 
 class CloudConfig(Settings):

@@ -5,7 +5,7 @@ from typing import Final
 
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.session_store import SessionStore
-from fcslam.geometry import se2
+from fcslam.cloud.space import Space
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import Submap, build_submap, read_submap, self_violation, submap_bytes
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
@@ -26,9 +26,10 @@ _Key = tuple[KeyscanId, Channel]
 class SubmapCache:
     """Holds up to ``capacity`` submaps, packed; the least recently used one is dropped first."""
 
-    def __init__(self, sessions: SessionStore, graph: JointGraph, capacity: int) -> None:
+    def __init__(self, sessions: SessionStore, graph: JointGraph, space: Space, capacity: int) -> None:
         self._sessions = sessions
         self._graph = graph
+        self._space = space
         self._capacity = capacity
         self._entries: dict[_Key, _Entry] = {}
         """The one used last is the last."""
@@ -77,6 +78,6 @@ class SubmapCache:
     def _scans(self, place: Place) -> list[tuple[PointScan, FloatArray]]:
         robot = place.id.robot
         lasers, anchor = self._sessions.lasers(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]
-        poses = se2.between(anchor, self._graph.chain(robot, place.first, place.last))
+        poses = self._space.chain_in_plane(place.id, anchor, self._graph.chain(robot, place.first, place.last))
         keyscans = self._sessions.keyscans(robot, place.first, place.last)
         return [(keyscan_points(keyscan, lasers), pose) for keyscan, pose in zip(keyscans, poses, strict=True)]

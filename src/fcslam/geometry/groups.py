@@ -36,6 +36,8 @@ class Group(NamedTuple):
     """Matrix Ad with ``T exp(v) T^-1 = exp(Ad v)``, shape (..., d, d)."""
     to_plane: Callable[[Any], _Array]
     """x, y and heading, shape (..., 3)."""
+    from_plane: Callable[[Any], _Array]
+    """The pose of x, y and heading, level at height 0."""
 
     @property
     def axes(self) -> int:
@@ -96,6 +98,7 @@ SE2 = Group(
     se2.log_jacobian,
     se2.adjoint,
     _planar,
+    _planar,
 )
 SE3 = Group(
     se3.IDENTITY,
@@ -109,6 +112,7 @@ SE3 = Group(
     se3.log_jacobian,
     se3.adjoint,
     se3.to_plane,
+    se3.from_plane,
 )
 
 

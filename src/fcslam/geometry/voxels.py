@@ -26,20 +26,33 @@ def voxel_keys(points: NDArray[np.int64] | Steps) -> NDArray[np.int64]:
     return keys
 
 
-def voxelised(points_m: NDArray[np.float64]) -> Steps:
-    """The middle of the points (N, 3), metres, in each voxel; voxels in ascending order, without those outside.
+def voxelised(
+    points_m: NDArray[np.float64], scans: NDArray[np.int64], origins_m: NDArray[np.float64]
+) -> tuple[Steps, NDArray[np.uint8]]:
+    """The middle of the points (N, 3), metres, in each voxel, and the scan that saw it.
 
-    Of more than ``MOST_POINTS`` voxels the nearest ones are kept.
+    ``scans`` (N,): of each point, as a row of ``origins_m`` (M, 3), where the scanner was. Of several scans, the one
+    that was nearest counts. Voxels are in ascending order, without those outside. Of more than ``MOST_POINTS`` voxels
+    the nearest ones are kept.
     """
     low, high = (VOXEL_STEPS * STEP_M * np.array(corner) for corner in (LOWEST, END))
-    inside = points_m[((points_m >= low) & (points_m < high)).all(axis=1)]
+    kept = ((points_m >= low) & (points_m < high)).all(axis=1)
+    inside, scans = points_m[kept], scans[kept]
     voxels = np.floor(inside / (VOXEL_STEPS * STEP_M)).astype(np.int64)
     unique, number, counts = np.unique(voxel_keys(VOXEL_STEPS * voxels), return_inverse=True, return_counts=True)
     middle = np.column_stack([np.bincount(number, axis) for axis in inside.T]) / counts[:, None]
     first = np.zeros((len(unique), 3), np.int64)
     first[number] = VOXEL_STEPS * voxels  # a middle that rounds into the next voxel stays in its own
     steps = np.clip(np.rint(middle / STEP_M).astype(np.int64), first, first + VOXEL_STEPS - 1)
+    farthest_first = np.argsort(-((inside - origins_m[scans]) ** 2).sum(axis=1), kind="stable")
+    seen_from = np.zeros(len(unique), np.uint8)
+    seen_from[number[farthest_first]] = scans[farthest_first]
     if len(steps) > MOST_POINTS:
-        nearest = np.argsort((steps**2).sum(axis=1), kind="stable")[:MOST_POINTS]
-        steps = steps[np.sort(nearest)]
-    return steps.astype(np.int16)
+        nearest = np.sort(np.argsort((steps**2).sum(axis=1), kind="stable")[:MOST_POINTS])
+        steps, seen_from = steps[nearest], seen_from[nearest]
+    return steps.astype(np.int16), seen_from
+
+
+def to_steps(origins_m: NDArray[np.float64]) -> Steps:
+    """Positions (M, 3), metres, in steps."""
+    return np.asarray(np.rint(origins_m / STEP_M), np.int16)

@@ -194,6 +194,15 @@ class PoseGraph:
         edges = edges.select(kept & variables[edges.i] & variables[edges.j])
         return PoseGraph.restored(poses[variables], replace(edges, i=number[edges.i], j=number[edges.j]))
 
+    def to_plane(self) -> "PoseGraph":
+        """The same graph in the plane: heights, roll and pitch are left out."""
+        if self.group is SE2:
+            return self
+        edges, to_plane = self.given(), self.group.to_plane
+        information = self.group.planar_information(edges.information)
+        planar = replace(edges, T_i_j=to_plane(edges.T_i_j), information=information)
+        return PoseGraph.restored(to_plane(self.poses()), planar)
+
     def chi2(self, poses: ArrayLike | None = None, rows: NDArray[np.int64] | None = None) -> FloatArray:
         """Squared Mahalanobis length of the edges' residuals at ``poses`` (N, P); None: initial poses.
 

@@ -9,6 +9,7 @@
     config.yaml                the complete configuration of the run
     quality.json, .png         the certificate: expected error of each square metre, open stretches, what to drive again
     mission.fcslam             packets, edits and configuration of the mission, with which it can go on
+    map.ply                    of robots with 3D LiDARs: points with normals, coloured by height
     map.pgm, map.yaml ...      map files, map_<k>.* for robots not connected to the first map
     localization/<robot>.csv   instead of local: of a robot that was localized in a finished map, pose, standard
                                deviations and quality at every laser scan
@@ -31,6 +32,7 @@ from fcslam.maps.occupancy_map import OccupancyMap, parse_map
 from fcslam.records import StrPath
 from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.tables import (
+    in_plane,
     metrics_json,
     read_closures,
     read_joins,
@@ -38,6 +40,7 @@ from fcslam.runs.tables import (
     read_metrics,
     read_robots,
     read_tum,
+    read_tum_6d,
     write_closures,
     write_joins,
     write_localized,
@@ -195,7 +198,9 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
 def _write(run: Run, folder: Path) -> None:
     (folder / TRAJECTORIES).mkdir()
     for trajectory in run.trajectories.values():
-        write_tum(folder / TRAJECTORIES / f"{trajectory.robot}.tum", trajectory.stamps, trajectory.T_map_base)
+        file = folder / TRAJECTORIES / f"{trajectory.robot}.tum"
+        in_space = trajectory.T_map_base_6d
+        write_tum(file, trajectory.stamps, trajectory.T_map_base if in_space is None else in_space)
     if run.local_maps:
         (folder / LOCAL).mkdir()
     for local in run.local_maps.values():
@@ -222,8 +227,9 @@ def _write(run: Run, folder: Path) -> None:
 def _read_trajectory(folder: Path, robot: str, map_index: int, floor: str) -> RobotTrajectory:
     if not _SAFE_NAME.fullmatch(robot):
         raise ValueError(f"{ROBOTS}: {robot!r} is not a robot's name")
-    stamps, poses = read_tum(folder / TRAJECTORIES / f"{robot}.tum", folder)
-    return RobotTrajectory(robot, map_index, stamps, poses, floor)
+    stamps, poses = read_tum_6d(folder / TRAJECTORIES / f"{robot}.tum", folder)
+    in_space = poses if poses[:, 2:5].any() else None
+    return RobotTrajectory(robot, map_index, stamps, in_plane(poses), floor, in_space)
 
 
 def _read_local_map(run: Path, robot: str) -> LocalMap:

@@ -24,6 +24,8 @@ class RobotTrajectory:
     """Poses (x, y, theta) of ``base`` in the coordinate frame of the robot's map, metres and radians, shape (N, 3)."""
     floor: str = ""
     """Floor that the session named; empty: none."""
+    T_map_base_6d: FloatArray | None = None
+    """The same poses with six degrees of freedom, (x, y, z, qx, qy, qz, qw), shape (N, 7); None: of a map in 2D."""
 
     @property
     def path_length_m(self) -> float:

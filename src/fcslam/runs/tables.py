@@ -29,14 +29,21 @@ _LOCALIZED_COLUMNS = ["stamp", "x", "y", "theta", "sigma_x", "sigma_y", "sigma_t
 _REASON_COLUMNS = ["reason", "value", "limit", "setting"]
 _CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", "status", *_REASON_COLUMNS]
 _JOIN_COLUMNS = [field.name for field in fields(Join)]
+_SPACE_LINE = "%.9f" + 7 * " %.9f" + "\n"
 _TUM_LINE = "%.9f %.9f %.9f 0 0 0 %.9f %.9f\n"
 
 
 def write_tum(path: Path | BinaryIO, stamps: FloatArray, T_map_base: FloatArray) -> None:
-    """Write poses (N, 3) as TUM lines ``stamp x y 0 0 0 qz qw``, nine digits after the point."""
-    half = T_map_base[:, 2] / 2.0
-    rows = np.column_stack((stamps, T_map_base[:, :2], np.sin(half), np.cos(half)))
-    text = "".join(_TUM_LINE % tuple(row) for row in rows.tolist()).encode()
+    """Write poses as TUM lines ``stamp x y z qx qy qz qw``, nine digits after the point.
+
+    Shape (N, 7), or (N, 3) in the plane.
+    """
+    if T_map_base.shape[1] == 7:
+        line, rows = _SPACE_LINE, np.column_stack((stamps, T_map_base))
+    else:
+        half = T_map_base[:, 2] / 2.0
+        line, rows = _TUM_LINE, np.column_stack((stamps, T_map_base[:, :2], np.sin(half), np.cos(half)))
+    text = "".join(line % tuple(row) for row in rows.tolist()).encode()
     if isinstance(path, Path):
         path.write_bytes(text)
     else:
@@ -44,7 +51,21 @@ def write_tum(path: Path | BinaryIO, stamps: FloatArray, T_map_base: FloatArray)
 
 
 def read_tum(path: Path, within: Path | None = None) -> tuple[FloatArray, FloatArray]:
-    """Stamps (N,) and poses (N, 3) of a TUM file, in its order."""
+    """Stamps (N,) and poses (N, 3) in the plane of a TUM file, in its order."""
+    stamps, poses = read_tum_6d(path, within)
+    return stamps, in_plane(poses)
+
+
+def in_plane(poses: FloatArray) -> FloatArray:
+    """x, y and heading, shape (N, 3), of poses (N, 7)."""
+    x, y, z, w = poses[:, 3:].T
+    tilted = x.any() or y.any()
+    theta = np.arctan2(2.0 * (x * y + z * w), 1.0 - 2.0 * (y * y + z * z)) if tilted else 2.0 * np.arctan2(z, w)
+    return frozen(np.column_stack((poses[:, :2], np.arctan2(np.sin(theta), np.cos(theta)))))
+
+
+def read_tum_6d(path: Path, within: Path | None = None) -> tuple[FloatArray, FloatArray]:
+    """Stamps (N,) and poses (N, 7) of a TUM file, in its order."""
     try:
         rows = [_tum_fields(line) for line in read_text(path, within).splitlines() if line.strip()]
         table = np.array(rows, dtype=np.float64).reshape(-1, 8)
@@ -52,9 +73,7 @@ def read_tum(path: Path, within: Path | None = None) -> tuple[FloatArray, FloatA
         raise InputError(f"{path}: not a TUM trajectory ({error})") from error
     if not np.all(np.isfinite(table)):
         raise InputError(f"{path}: not a TUM trajectory (a number that is not finite)")
-    theta = 2.0 * np.arctan2(table[:, 6], table[:, 7])
-    poses = np.column_stack((table[:, 1], table[:, 2], np.arctan2(np.sin(theta), np.cos(theta))))
-    return frozen(table[:, 0]), frozen(poses)
+    return frozen(table[:, 0]), frozen(table[:, 1:])
 
 
 def _tum_fields(line: str) -> list[float]:

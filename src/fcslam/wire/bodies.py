@@ -214,7 +214,7 @@ def _write_voxel_map(local: VoxelMap) -> pb.VoxelMap:
         last=local.last,
         t_base_ground=_write_space_pose(local.T_base_ground),
         count=len(local.points),
-        points=pack_points(local.points),
+        points=pack_points(local.points, local.seen_from),
         origins=local.origins.ravel().tolist(),
     )
 
@@ -222,7 +222,7 @@ def _write_voxel_map(local: VoxelMap) -> pb.VoxelMap:
 def _read_voxel_map(message: pb.VoxelMap, envelope: pb.Packet) -> VoxelMap:
     _check_at_most(message.count, MOST_POINTS, "voxel map: points")
     _check_at_most(len(message.origins), 3 * limits.MAXIMUM_ORIGINS, "voxel map: coordinates of origins")
-    points = unpack_points(message.points, message.count)
+    points, seen_from = unpack_points(message.points, message.count)
     origins = np.array(message.origins, np.int64)
     if len(origins) % 3 or not are_inside(origins.reshape(-1, 3)):
         raise PacketError("voxel map: an origin is incomplete or outside the bounds")
@@ -233,6 +233,7 @@ def _read_voxel_map(message: pb.VoxelMap, envelope: pb.Packet) -> VoxelMap:
         _read_space_pose(message, "t_base_ground"),
         frozen(points, np.int16),
         frozen(origins.reshape(-1, 3), np.int16),
+        frozen(seen_from, np.uint8),
     )
 
 

@@ -214,6 +214,10 @@ def _check_voxel_map(local: VoxelMap) -> None:
         _require(0 < len(steps) <= most, f"voxel map: {len(steps)} {name}, not in 1..{most}")
         _require(are_inside(steps), f"voxel map: {name} are outside the bounds")
     _require(bool((np.diff(voxel_keys(local.points)) > 0).all()), "voxel map: voxels are not in ascending order")
+    _check_shape(local.seen_from, (len(local.points),), "voxel map: seen_from")
+    _require(local.seen_from.dtype == np.uint8, f"voxel map: seen_from are {local.seen_from.dtype}, not bytes")
+    is_known = int(local.seen_from.max()) < len(local.origins)
+    _require(is_known, "voxel map: a point was seen from an origin that is not there")
 
 
 def _check_span(body: Place | VoxelMap, what: str) -> None:

@@ -23,7 +23,7 @@ KEYPOINT_AXES = {Channel.LIDAR: 2, Channel.CAMERA: 3}
 """Coordinates of a keypoint; a camera sees how high it is, too."""
 BYTES_PER_AXIS = 2
 
-BYTES_PER_POINT = 4
+BYTES_PER_POINT = 5
 MAXIMUM_ORIGINS = 256
 """Positions of the scanner in a voxel map."""
 

@@ -90,15 +90,16 @@ def unpack_descriptors(data: bytes, count: int) -> Codes:
     return np.packbits(bits.T, axis=1)
 
 
-def pack_points(points: Steps) -> bytes:
-    """Encode the points (N, 3) of a voxel map, by voxels in ascending order: differences of voxels, places in them."""
+def pack_points(points: Steps, seen_from: NDArray[np.uint8]) -> bytes:
+    """Encode the points (N, 3) of a voxel map, by voxels in ascending order, and their origins (N,): differences of
+    voxels, places in them, origins."""
     steps = np.diff(voxel_keys(points), prepend=0).astype("<u4").view(np.uint8).reshape(-1, 4)[:, :3]
     place = (points % VOXEL_STEPS) @ (VOXEL_STEPS**2, VOXEL_STEPS, 1)
-    return _deflate(steps.T.tobytes() + place.astype(np.uint8).tobytes())
+    return _deflate(steps.T.tobytes() + place.astype(np.uint8).tobytes() + seen_from.tobytes())
 
 
-def unpack_points(data: bytes, count: int) -> Steps:
-    """Inverse of ``pack_points``: ``count`` points, shape (count, 3)."""
+def unpack_points(data: bytes, count: int) -> tuple[Steps, NDArray[np.uint8]]:
+    """Inverse of ``pack_points``: ``count`` points, shape (count, 3), and their origins, shape (count,)."""
     plain = _inflate(data, BYTES_PER_POINT * count, "voxel map: points")
     planes = np.frombuffer(plain, np.uint8).reshape(BYTES_PER_POINT, count)
     steps = planes[:3].astype(np.int64)
@@ -108,7 +109,7 @@ def unpack_points(data: bytes, count: int) -> Steps:
         raise PacketError("voxel map: a point is outside its bounds")
     voxels = np.stack((keys >> 16, keys >> 8 & 255, keys & 255), axis=1) + LOWEST
     within = np.stack((place // VOXEL_STEPS**2, place // VOXEL_STEPS % VOXEL_STEPS, place % VOXEL_STEPS), axis=1)
-    return np.asarray(VOXEL_STEPS * voxels + within, np.int16)
+    return np.asarray(VOXEL_STEPS * voxels + within, np.int16), planes[4]
 
 
 def _high_and_low(numbers: NDArray[np.uint16]) -> bytes:
