@@ -95,7 +95,11 @@ def run_of(
         config_yaml=config_yaml,
         pose_graph_g2o=g2o_text(result.space_graph or result.graph, _ids([mapped[name] for name in sorted(tracks)])),
         map_files=map_files,
-        local_maps={name: _local_map(mapped[name], track, grid) for name, track in tracks.items() if with_local_maps},
+        local_maps={
+            name: _local_map(mapped[name], track, grid, _map_alone(mapped[name], result, fused))
+            for name, track in tracks.items()
+            if with_local_maps
+        },
         quality=_quality(certificates, fused),
     )
 
@@ -140,8 +144,16 @@ def _link_metrics(link: str, traffic: Mapping[str, Traffic], tracks: Mapping[str
     ]
 
 
-def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig) -> LocalMap:
-    fused = fuse(robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.lasers}, grid)
+def _map_alone(robot: MappedRobot, result: FleetResult, maps: Mapping[int, OccupancyMap]) -> OccupancyMap | None:
+    """The map of a robot that is alone in it, as it made it."""
+    indices = [*(other.map_index for other in result.robots), *(region.map_index for region in result.regions)]
+    is_own = indices.count(robot.map_index) == 1 and np.array_equal(robot.T_map_base, robot.T_local_base)
+    return maps[robot.map_index] if is_own else None
+
+
+def _local_map(robot: MappedRobot, track: Track, grid: OccupancyConfig, fused: OccupancyMap | None) -> LocalMap:
+    if fused is None:
+        fused = fuse(robot.keyscans, robot.T_local_base[robot.numbers()], {robot.robot: robot.lasers}, grid)
     name = f"{robot.robot}.pgm"
     return LocalMap(
         robot.robot,

@@ -55,6 +55,14 @@ def over_steps(error: OdometryError, moved_m: float, step_m: float) -> OdometryE
     return OdometryError(share * error.position_m, share * error.heading_rad)
 
 
+def judged_by(learned: OdometryError, turned_rad: float) -> OdometryError:
+    """Error of odometry that a match is judged by, after a turn that odometry measured, radians."""
+    return OdometryError(
+        max(LEAST_SIGMA_M + SIGMA_PER_TURN * turned_rad, learned.position_m),
+        max(LEAST_SIGMA_RAD + SIGMA_PER_TURN * turned_rad, learned.heading_rad),
+    )
+
+
 def resolve(
     scan: PointScan,
     field: SurfelField,
@@ -76,10 +84,7 @@ def resolve(
     Returns:
         The chosen match, and whether the scan contradicts odometry that is chosen, so that nothing is learned from it.
     """
-    error = OdometryError(
-        max(LEAST_SIGMA_M + SIGMA_PER_TURN * turned_rad, learned.position_m),
-        max(LEAST_SIGMA_RAD + SIGMA_PER_TURN * turned_rad, learned.heading_rad),
-    )
+    error = judged_by(learned, turned_rad)
     innovation = se2.motion(T_field_guess, match.T_field_base)
     distance2 = error.mahalanobis2(innovation)
     is_far, is_seen = distance2 >= FAR**2, match.known >= LEAST_KNOWN

@@ -8,7 +8,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.lidar.correlative import SearchWindow, search
-from fcslam.lidar.evidence import CLEAR, CLEAR_GAIN, FAR, LEAST_KNOWN, over_steps, resolve
+from fcslam.lidar.evidence import CLEAR, CLEAR_GAIN, FAR, LEAST_KNOWN, judged_by, over_steps, resolve
 from fcslam.lidar.field import CELL_M, SurfelField
 from fcslam.lidar.matching import FIXED, WIDE_SCALE_M, ScanMatch, match_scan
 from fcslam.lidar.odometry import FIRST_MATCHES, PRIOR_TAIL, OdometryError, OdometryModel, OdometryTrust, odometry_error
@@ -134,10 +134,10 @@ class ScanTracker:
         error = odometry_error(moved_m, turned_rad, self._odometry)
         thinned = points.thinned(POINT_SPACING_M, POINT_LIMIT)
         velocity = self._velocity_information(scan.sweep)
-        match = self._match(points, thinned, T_local_guess, error, velocity)
+        match = self._match(points, thinned, T_local_guess, error, turned_rad, velocity)
         has_jumped = contradicts = False
         if match.explained < DOUBTFUL and self._is_long_step(T_local_guess):
-            other = self._match(points, thinned, state.T_local_base, error, velocity)
+            other = self._match(points, thinned, state.T_local_base, error, turned_rad, velocity)
             is_fixed = weakest_sigma_m(other.information) < SEARCH_SIGMA_M
             is_better = other.log_likelihood > match.log_likelihood + JUMP_GAIN
             if is_fixed and is_better and other.explained >= JUMP_SHARE:
@@ -234,6 +234,7 @@ class ScanTracker:
         thinned: PointScan,
         T_local_guess: FloatArray,
         error: OdometryError,
+        turned_rad: float,
         velocity: FloatArray,
     ) -> ScanMatch:
         field = self._fields[0][0]
@@ -246,7 +247,8 @@ class ScanTracker:
             tail = PRIOR_TAIL if self._state.trust.matches >= FIRST_MATCHES else math.inf
             match = match_scan(thinned, field, T_local_guess, prior.information, velocity, prior_tail=tail)
         innovation = se2.motion(T_local_guess, match.T_field_base)
-        is_doubtful = match.explained < DOUBTFUL * match.known or learned.mahalanobis2(innovation) >= FAR**2
+        contradicts = judged_by(learned, turned_rad).mahalanobis2(innovation) >= FAR**2
+        is_doubtful = match.explained < DOUBTFUL * match.known or contradicts
         if not is_doubtful and not self._is_long_step(T_local_guess):
             return match
         found = search(points, field, T_local_guess, SEARCH_WINDOW, visible_only=True, better_than=match.T_field_base)

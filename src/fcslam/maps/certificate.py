@@ -175,27 +175,21 @@ def relative_error(
     Of a place without any so near, that of the nearest one. Places that are not ``wanted`` have the smallest error.
     """
     result = np.full(len(poses), FLOOR_M)
+    if len(poses) < 2:
+        return result
+    rows = np.arange(len(poses)) if wanted is None else wanted
     blocks = covariance.reshape(len(poses), 3, len(poses), 3).transpose(0, 2, 1, 3)
-    for k in range(len(poses)) if wanted is None else wanted:
-        away_m = _distances(poses, poses[k])
-        away_m[k] = math.inf
-        near = np.flatnonzero(away_m <= within_m)
-        if not len(near) and len(poses) > 1:
-            near = np.argsort(away_m)[:1]
-        if len(near):
-            apart = poses[near, :2] - poses[k, :2]
-            swing = apart @ _S.T  # change of the other's position by a turn of this place
-            own, other, cross = blocks[k, k], blocks[near, near], blocks[near, k]
-            variance = (
-                other[:, 0, 0]
-                + other[:, 1, 1]
-                + own[0, 0]
-                + own[1, 1]
-                - 2.0 * (cross[:, 0, 0] + cross[:, 1, 1])
-                + own[2, 2] * (swing**2).sum(axis=1)
-                - 2.0 * (swing * (cross[:, :2, 2] - own[:2, 2])).sum(axis=1)
-            )
-            result[k] = math.sqrt(max(float(variance.mean()), 0.0) + FLOOR_M**2)
+    own, cross = blocks[rows, rows][:, None], blocks[:, rows].swapaxes(0, 1)
+    apart = poses[:, :2] - poses[rows, None, :2]
+    swing = apart @ _S.T  # change of the other's position by a turn of this place
+    position = np.einsum("kkii->k", blocks[..., :2, :2])
+    variance = position + position[rows, None] - 2.0 * (cross[..., 0, 0] + cross[..., 1, 1])
+    turns = cross[..., :2, 2] - own[..., :2, 2]
+    variance += own[..., 2, 2] * (swing**2).sum(axis=2) - 2.0 * (swing * turns).sum(axis=2)
+    away_m = np.hypot(apart[..., 0], apart[..., 1])
+    away_m[np.arange(len(rows)), rows] = np.inf
+    near = away_m <= np.maximum(within_m, away_m.min(axis=1, keepdims=True))
+    result[rows] = np.sqrt(np.maximum((variance * near).sum(axis=1) / near.sum(axis=1), 0.0) + FLOOR_M**2)
     return result
 
 
