@@ -6,7 +6,7 @@ Counted on the split logs: encoded packets, without what a network adds to them.
 constraints and places go up; corrections and acknowledgements come down. Seconds are those of the recordings, paths the
 odometry's. "A place with 300 descriptors" is every place that has as many, cut to its 300 strongest and encoded.
 
-Thinner places: the real command with `robot.lidar.keyscans.submap_every_m` at 2 (the default), 4, 8 and 16 m and
+Thinner places: the real command with `robot.lidar.keyscans.submap_every_m` at 2, 4 (the default), 8 and 16 m and
 nothing else changed; a robot's own closures become rarer with its submaps. Errors are over the relations between
 different robots, of which those between robots in different maps cannot be used. Closures as
 `benchmarks/closures.py` says how they are judged.

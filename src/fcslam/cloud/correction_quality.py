@@ -11,8 +11,8 @@ from fcslam.places.matcher import PlaceMatch
 from fcslam.records import KeyscanId, Place
 from fcslam.storage.snapshot import Kept
 
-FRESH_M = 4.0
-"""Travel, in metres, within which a comparison counts in full; the next place is about 2 m away."""
+FRESH_M = 8.0
+"""Travel, in metres, within which a comparison counts in full; the next place is about 4 m away."""
 HALVED_M = 10.0
 """Further travel, in metres, after which a comparison counts half: the robot may have been carried since."""
 TIE_HALVED_M = 30.0

@@ -20,6 +20,10 @@ SOLVE_AFTER, SOLVE_AFTER_SHARE = 20, 0.08
 """The graph is solved once this many closures wait, or this share of the number of keyscans if that is more. The time
 of a solve grows with the graph, so solves become rarer and the mean cost per scan stays constant."""
 
+DENSE_M = 50.0
+"""Travel from the beginning of a session along which submaps are twice as dense, metres: robots that have just met have
+few places to be joined by."""
+
 
 @dataclass(frozen=True, slots=True)
 class FinishedSubmap:
@@ -91,7 +95,7 @@ class LidarBackend:
         if middle == len(window) or (not at_end and travel[-1] < travel[middle] + SUBMAP_REACH_M):
             return None
         anchor = window[middle]
-        self._next_anchor_m = anchor.travel_m + gate.submap_every_m
+        self._next_anchor_m = anchor.travel_m + gate.submap_every_m * (0.5 if anchor.travel_m < DENSE_M else 1.0)
         first = bisect_left(travel, anchor.travel_m - SUBMAP_REACH_M)
         last = bisect_right(travel, anchor.travel_m + SUBMAP_REACH_M) - 1
         submap = build_submap(

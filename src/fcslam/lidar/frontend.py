@@ -71,7 +71,11 @@ class KeyscanConfig(Settings):
     minimum_travel_distance_m: float = Field(
         default=0.25, gt=0, description="travel since the last keyscan after which a scan becomes a keyscan [m]"
     )
-    submap_every_m: float = Field(default=2.0, gt=0, description="travel between the anchors of two submaps [m]")
+    submap_every_m: float = Field(
+        default=4.0,
+        gt=0,
+        description="travel between the anchors of two submaps, half of it as a session begins [m]",
+    )
 
 
 class LidarConfig(Settings):
