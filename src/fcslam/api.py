@@ -3,6 +3,7 @@
 import logging
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,7 +90,8 @@ def map_recordings(
         prepare_output(Path(output), force)
     earlier = EMPTY if onto is None else read_mission(Path(onto))
     settings = settings_of(continued_config(earlier) if config is None else config)
-    opened = _opened(recordings, bag_options, settings.robot.lidar, at_least=1 if onto is None else 0)
+    options = in_3d(bag_options, settings)
+    opened = _opened(recordings, options, settings.robot.lidar, at_least=1 if onto is None else 0)
     robots = split_recordings(opened, split)
     if isinstance(floors, str):
         floors = {robot.name: floors for robot in robots if floors}
@@ -195,6 +197,11 @@ def changes(
     if output is not None:
         save_changes(found, Path(output), force)
     return found
+
+
+def in_3d(options: BagOptions | None, settings: MissionConfig) -> BagOptions | None:
+    """The options with which recordings are read: clouds whole, if poses are in space."""
+    return options if settings.fleet.dimensions == 2 else replace(options or BagOptions(), in_3d=True)
 
 
 def split_recordings(recordings: list[Source], parts: int) -> list[Source]:

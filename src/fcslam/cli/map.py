@@ -94,6 +94,14 @@ def map_recordings(
             "forces nothing; `-c 'fleet.start_sigma=[M,RAD]'` says how exactly you know it. Can be repeated.",
         ),
     ] = None,
+    in_space: Annotated[
+        bool,
+        typer.Option(
+            "--3d",
+            help="Map 3D LiDARs with six degrees of freedom: trajectories with height, roll and pitch, and map.ply. "
+            "Robots with 2D LiDARs share the map.",
+        ),
+    ] = False,
     sensors: Sensors = None,
     force: Force = False,
     quiet: Quiet = False,
@@ -102,8 +110,9 @@ def map_recordings(
     """Map recordings of several robots into one map, with the trajectory of every robot and all closures."""
     with _without_collection():
         from fcslam.anchoring.anchors import read_anchors
-        from fcslam.api import split_recordings
+        from fcslam.api import in_3d, split_recordings
         from fcslam.cluster.verifying import verifying
+        from fcslam.config import changed
         from fcslam.mission.mission import MissionInputs, continued_config
         from fcslam.mission.mission_file import EMPTY, read_mission
         from fcslam.robot.calibrating import calibrated
@@ -114,8 +123,10 @@ def map_recordings(
         prepare_output(output, force)
         earlier = EMPTY if onto is None else read_mission(onto)
         settings = with_starts(mission_config(config, continued_config(earlier)), start)
+        if in_space:
+            settings = changed(settings, {"fleet": {"dimensions": 3}}, "--3d")
         anchors = read_anchors(plan, plan_scale, tags)
-        options = bag_options(sensors)
+        options = in_3d(bag_options(sensors), settings)
         if not logs and onto is None:
             raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         with compiled(notices(quiet)):
@@ -242,7 +253,7 @@ def _report(
         lines.append(f"{maps} maps" if joined else f"{maps} maps: one for each robot")
     lines += [*_join_lines(run), *_separation_lines(run)] if joined else []
     lines += anchoring_lines(run.map_files)
-    lines += [f"map: {output / name}" for name in sorted(run.map_files) if name.endswith(".png")]
+    lines += [f"map: {output / name}" for name in sorted(run.map_files) if name.endswith((".png", ".ply"))]
     typer.echo("\n".join(lines))
 
 

@@ -117,6 +117,8 @@ def run_mission(
     known = [*onto.robots, *recordings]
     _check_known("a veto", (name for veto in inputs.vetoes for name in (veto.robot_i, veto.robot_j)), known)
     _check_known("a start", config.fleet.starts, known)
+    if config.fleet.dimensions == 3 and inputs.anchors != Anchors():
+        raise InputError("floor plans and surveyed tags place maps in the plane; leave them out with --3d")
     sources = on_floors(sources, inputs.floors)
     cloud = MissionCloud(config, inputs)
     meter = _Meter(watch, cloud, known)
@@ -181,6 +183,8 @@ class MissionCloud:
         return replace(run, mission=mission)
 
     def _placed(self, result: FleetResult) -> Anchored:
+        if self.config.fleet.dimensions == 3:  # what anchors say is of the plane
+            return Anchored(result)
         anchors, is_fixed = self._inputs.anchors, any(robot.fixes for robot in result.robots)
         if anchors == Anchors() and not is_fixed and not result.sightings:
             return Anchored(result)

@@ -48,3 +48,5 @@ class BagOptions:
     robot: str | None = None
     cloud_band: CloudBand = field(default_factory=CloudBand)
     correction: BagCorrection = field(default_factory=BagCorrection)
+    in_3d: bool = False
+    """Whether point clouds are read whole, and not a band of their heights as a 2D scan."""
