@@ -15,14 +15,14 @@ from fcslam.cloud.report import fuse_members
 from fcslam.errors import SourceError
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.maps.occupancy_map import Occupancy, map_yaml, pgm_bytes
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from tests.planned_building import OTHER_WALLS, WALLS, mapped, off_m, plan_of
 
 pytestmark = pytest.mark.slow
 
 
 def placed(result, plan=None, by_hand=()):
-    anchors = Anchors(None if plan is None else BuildingPlan(plan))
+    anchors = Anchors(BuildingPlan(plan) if isinstance(plan, OccupancyMap) else plan)
     return anchored(result, anchors, by_hand, lambda members: fuse_members(members, OccupancyConfig()))
 
 
@@ -48,6 +48,22 @@ def test_lengths_get_the_scale_of_the_plan(scale):
     assert off_m(placing, true).max() < 0.05
     (before,), (after,) = result.robots, placing.result.robots
     assert after.keyscans[0].ranges_m / before.keyscans[0].ranges_m == pytest.approx(1.0 / scale, abs=0.001)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda plan: plan.mirrored(), "it fits mirrored"),
+        (lambda plan: plan.scaled(1.1), "the plan is 11.1 m by 17.7 m, and the map 9.9 m by 15.9 m; it fits at 0.909"),
+        (
+            lambda plan: replace(plan.scaled(25.4), unit_m=0.0254),
+            "and the map 9.9 m by 15.9 m; if it is drawn in millimetres and not in inches: --plan-scale 0.001",
+        ),
+    ],
+)
+def test_what_makes_a_plan_fit_is_said(change, words):
+    result, _ = mapped()
+    assert words in report_of(placed(result, change(BuildingPlan(plan_of()))))["reason"]
 
 
 def test_the_plan_of_another_building_changes_nothing():
@@ -111,7 +127,7 @@ def picture(folder, colours=((255, 255, 255), (0, 0, 0)), name="plan.png"):
     "colours", [((255, 255, 255), (0, 0, 0)), ((90, 40, 10), (255, 230, 200)), ((240, 250, 255), (160, 90, 60))]
 )
 def test_a_drawing_is_read_in_any_colours_without_its_text(tmp_path, colours):
-    plan, true = read_plan(picture(tmp_path, colours), 0.02), plan_of()
+    plan, true = read_plan(picture(tmp_path, colours), 0.02).drawing, plan_of()
     lines, expected = plan.cells == Occupancy.OCCUPIED, true.cells == Occupancy.OCCUPIED
     assert np.array_equal(lines, expected)
     assert plan.origin_xy == (0.0, 0.0)
@@ -121,7 +137,7 @@ def test_a_map_of_ros_is_a_plan_in_its_own_coordinates(tmp_path):
     true = plan_of()
     (tmp_path / "map.pgm").write_bytes(pgm_bytes(true))
     (tmp_path / "map.yaml").write_text(map_yaml(true, "map.pgm"))
-    plan = read_plan(tmp_path / "map.yaml")
+    plan = read_plan(tmp_path / "map.yaml").drawing
     assert np.array_equal(plan.cells, true.cells)
     assert plan.origin_xy == pytest.approx(true.origin_xy)
 
@@ -138,9 +154,15 @@ def drawing(folder, unit):
     return folder / "plan.dxf"
 
 
+def test_a_drawing_that_names_a_wrong_unit_gets_the_scales_that_are_possible(tmp_path):
+    assert read_plan(drawing(tmp_path, 4)).unit_m == 0.001
+    with pytest.raises(SourceError, match=r"16.0 m by 10.0 m if it is drawn in millimetres: --plan-scale 0.001;"):
+        read_plan(drawing(tmp_path, 4), 1.0)
+
+
 @pytest.mark.parametrize(("unit", "scale"), [(6, None), (4, None), (0, 0.001)])
 def test_a_drawing_of_lines_is_read_in_its_unit(tmp_path, unit, scale):
-    plan = read_plan(drawing(tmp_path, unit), scale)
+    plan = read_plan(drawing(tmp_path, unit), scale).drawing
     rows, columns = np.nonzero(plan.cells == Occupancy.OCCUPIED)
     at = np.column_stack((columns, rows)) * plan.resolution_m + plan.origin_xy
     assert at.min(axis=0) == pytest.approx((0.0, 0.0), abs=0.03)
@@ -171,9 +193,8 @@ def test_a_plan_with_more_walls_than_a_field_holds_gets_one_line(tmp_path):
     pixels = np.full((2000, 2000), 255, np.uint8)
     pixels[::25, 50:-50] = 0
     cv2.imwrite(str(tmp_path / "hatched.png"), pixels)
-    with pytest.raises(SourceError, match=r"hatched.png: has too many walls; at most 1.6 km can be used; crop it"):
-        read_anchors(tmp_path / "hatched.png", 0.02)
-    assert read_anchors(picture(tmp_path), 0.02).plan is not None
+    placing = placed(mapped()[0], read_anchors(tmp_path / "hatched.png", 0.02).plan)
+    assert "the plan has too many walls; at most 1.6 km can be used: check its unit, or" in report_of(placing)["reason"]
 
 
 def test_a_robot_whose_ranges_stay_with_it_is_placed_with_the_others_of_its_map():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fcslam.cloud.result import FleetResult, MappedRobot
-from fcslam.errors import InputError, SourceError
+from fcslam.errors import InputError
 from fcslam.lidar.field import TOO_MANY_WALLS
 from fcslam.lidar.submap import Submap
 from fcslam.maps.changes import grown
@@ -55,13 +55,10 @@ def read_anchors(plan: StrPath | None = None, plan_scale: float | None = None, t
         )
     if plan is None and tags is None:  # as most missions
         return Anchors()
-    from fcslam.anchoring.plan import BuildingPlan
     from fcslam.anchoring.plan_files import read_plan
     from fcslam.anchoring.surveyed_tags import read_survey
 
-    building = None if plan is None else BuildingPlan(read_plan(Path(plan), plan_scale))
-    if building is not None and building.submap.field.is_full:
-        raise SourceError(f"{plan}: {TOO_MANY_WALLS}; crop it")
+    building = None if plan is None else read_plan(Path(plan), plan_scale)
     return Anchors(building, None if tags is None else read_survey(Path(tags)))
 
 
@@ -95,16 +92,14 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
         alignment = None
         if anchors.plan is not None:
             building = map_submap(part.robots) if any(robot.keyscans for robot in part.robots) else None
-            is_full = building is not None and building.field.is_full
-            if building is not None and not is_full:
+            if building is not None and not building.field.is_full and not anchors.plan.submap.field.is_full:
                 alignment = align_to_plan(anchors.plan, building, is_placed)
             if alignment is not None and not alignment.refusal:
                 part, scales = fit_to_plan(alignment.plan, part, alignment.T_plan_map)
                 reports.append(_plan_report(k, alignment, map_submap(part.robots), scales))
                 pictures.append(fuse(part.robots))
             else:
-                reason = "the map has no walls" if alignment is None else alignment.refusal
-                reports.append({"map": k, "aligned": False, "reason": f"it {TOO_MANY_WALLS}" if is_full else reason})
+                reports.append({"map": k, "aligned": False, "reason": _refusal(anchors.plan, building, alignment)})
         in_plan = alignment is not None and not alignment.refusal
         by_tags = False
         if anchors.survey is not None:
@@ -130,6 +125,18 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
         files[PLAN_JSON] = _json({"maps": reports, "drawing": outlines(drawing.cells == Occupancy.OCCUPIED, drawing)})
         files[PLAN_PNG] = _picture(drawing, pictures)
     return Anchored(result, files)
+
+
+def _refusal(plan: "BuildingPlan", building: Submap | None, alignment: "PlanAlignment | None") -> str:
+    """Why a map is not aligned with a plan."""
+    from fcslam.anchoring.alignment import misfit
+
+    if building is None or not len(building.surface):
+        return "the map has no walls"
+    if building.field.is_full:
+        return f"it {TOO_MANY_WALLS}"
+    reason = f"the plan {TOO_MANY_WALLS}: check its unit, or crop it" if alignment is None else alignment.refusal
+    return f"{reason}; {misfit(plan, building)}"
 
 
 def _plan_report(k: int, alignment: "PlanAlignment", mapped: Submap, scales: Mapping[str, float]) -> dict[str, object]:
