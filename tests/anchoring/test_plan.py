@@ -12,6 +12,7 @@ from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
 from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.report import fuse_members
+from fcslam.config import parse_yaml
 from fcslam.errors import SourceError
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.occupancy import OccupancyConfig
@@ -131,6 +132,23 @@ def test_a_drawing_is_read_in_any_colours_without_its_text(tmp_path, colours):
     lines, expected = plan.cells == Occupancy.OCCUPIED, true.cells == Occupancy.OCCUPIED
     assert np.array_equal(lines, expected)
     assert plan.origin_xy == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("is_picture", [True, False])
+def test_a_fleet_manager_gets_the_coordinates_of_plan_and_map(tmp_path, is_picture):
+    """Open-RMF counts from the upper left corner of a picture, with y up; a drawing has its own coordinates."""
+    assert read_plan(picture(tmp_path), 0.02).is_picture
+    assert not read_plan(drawing(tmp_path, 4)).is_picture
+    plan, (result, _) = BuildingPlan(plan_of(), is_picture=is_picture), mapped()
+    found = parse_yaml(placed(result, plan).files["rmf.yaml"].decode())["reference_coordinates"]
+    assert list(found) == ["L1"]
+    robot, rmf = np.array(found["L1"]["robot"]), np.array(found["L1"]["rmf"])
+    x, y = plan.drawing.origin_xy
+    offset = (x, y + plan.drawing.resolution_m * len(plan.drawing.cells)) if is_picture else (0.0, 0.0)
+    np.testing.assert_allclose(robot - rmf, np.tile(offset, (4, 1)), atol=1e-9)
+    assert np.linalg.matrix_rank(rmf - rmf.mean(axis=0)) == 2
+    other = placed(result, plan_of(OTHER_WALLS))
+    assert "rmf.yaml" not in other.files
 
 
 def test_a_map_of_ros_is_a_plan_in_its_own_coordinates(tmp_path):

@@ -14,8 +14,8 @@ from fcslam.lidar.field import TOO_MANY_WALLS
 from fcslam.lidar.submap import Submap
 from fcslam.maps.changes import grown
 from fcslam.maps.drawing import highlighted_png
-from fcslam.maps.exports import outlines
-from fcslam.maps.occupancy_map import GEOREFERENCE, Occupancy, OccupancyMap, map_stem
+from fcslam.maps.exports import outlines, rmf_yaml
+from fcslam.maps.occupancy_map import GEOREFERENCE, RMF_YAML, Occupancy, OccupancyMap, map_stem
 from fcslam.records import StrPath
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
 TAGS_JSON = "tags.json"
+FIRST_LEVEL = "L1"
+"""Of a map whose floor has no name."""
 ONLY_SCANS, ONLY_PLAN = "only in the scans", "only in the plan"
 
 FuseMembers = Callable[[Sequence[MappedRobot]], OccupancyMap]
@@ -121,6 +123,7 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
     if result.sightings or anchors.survey is not None:
         files[TAGS_JSON] = _json({"tags": tags, "distances": distances, "surveyed": surveyed})
     if anchors.plan is not None:
+        files |= _rmf(anchors.plan, [r.floor for r in result.robots if reports[r.map_index]["aligned"]])
         drawing = anchors.plan.drawing
         files[PLAN_JSON] = _json({"maps": reports, "drawing": outlines(drawing.cells == Occupancy.OCCUPIED, drawing)})
         files[PLAN_PNG] = _picture(drawing, pictures)
@@ -162,6 +165,11 @@ def _plan_report(k: int, alignment: "PlanAlignment", mapped: Submap, scales: Map
         "scales": {robot: round(scale, 5) for robot, scale in scales.items()},
         "deviations": deviations,
     }
+
+
+def _rmf(plan: "BuildingPlan", floors: Sequence[str]) -> dict[str, bytes]:
+    """The file for Open-RMF, if robots on these floors are in maps that lie in the plan."""
+    return {RMF_YAML: rmf_yaml(plan.drawing, plan.is_picture, floors[0] or FIRST_LEVEL).encode()} if floors else {}
 
 
 def _geo_report(found: "Georeference") -> dict[str, object]:

@@ -28,6 +28,8 @@ class BuildingPlan:
     """Its lines are occupied, the other cells are free."""
     unit_m: float | None = None
     """Metres per pixel of a picture, or per unit of a DXF drawing; None: the plan has its own scale."""
+    is_picture: bool = True
+    """Whether the plan has pixels."""
     thickness_m: float = 0.0
     """By how much the sides of walls lie farther from their middle than they are drawn."""
 

@@ -66,7 +66,9 @@ def read_plan(path: Path, scale: float | None = None) -> BuildingPlan:
     cells = _solid(_without_text(plan.cells, plan.resolution_m), plan.resolution_m)
     if not (cells == Occupancy.OCCUPIED).any():
         raise SourceError(f"{path}: the plan shows no lines longer than {TEXT_M:g} m; check the scale and the colours")
-    return BuildingPlan(OccupancyMap(frozen(cells, np.uint8), plan.resolution_m, plan.origin_xy), unit_m)
+    return BuildingPlan(
+        OccupancyMap(frozen(cells, np.uint8), plan.resolution_m, plan.origin_xy), unit_m, path.suffix.lower() != ".dxf"
+    )
 
 
 def _ros_plan(path: Path, scale: float | None) -> OccupancyMap:

@@ -11,6 +11,7 @@
     mission.fcslam             packets, edits and configuration of the mission, with which it can go on
     map.ply                    of robots with 3D LiDARs: points with normals, coloured by height
     map.pgm, map.yaml ...      map files, map_<k>.* for robots not connected to the first map
+    rmf.yaml                   of a map that lies in a floor plan: where Open-RMF has it
     localization/<robot>.csv   instead of local: of a robot that was localized in a finished map, pose, standard
                                deviations and quality at every laser scan
     local/<robot>.tum          as trajectories/, in the robot's own map, which nothing but its own measurements made
@@ -28,7 +29,7 @@ from functools import cached_property
 from pathlib import Path
 
 from fcslam.errors import InputError
-from fcslam.maps.occupancy_map import OccupancyMap, parse_map
+from fcslam.maps.occupancy_map import RMF_YAML, OccupancyMap, parse_map
 from fcslam.records import StrPath
 from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.tables import (
@@ -176,7 +177,8 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
         raise InputError(f"{path}: not a run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one")
     try:
         robots = read_robots(path / ROBOTS, path)
-        pictures, certificates = (*path.glob("map*.*"), *path.glob("plan.*")), path.glob(f"{QUALITY}*.*")
+        pictures = [*path.glob("map*.*"), *path.glob("plan.*"), *path.glob(RMF_YAML)]
+        certificates = path.glob(f"{QUALITY}*.*")
         own_maps = robots if maps and (path / LOCAL).exists() else ()
         return Run(
             trajectories={robot: _read_trajectory(path, robot, *where) for robot, where in robots.items()},
