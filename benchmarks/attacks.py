@@ -1,6 +1,6 @@
 """One robot's token attacks a service: how long requests of other robots take, and when their packets take effect.
 
-    python benchmarks/attacks.py [--robots 20] [--seconds 40] [--ways NAME ...]
+    python benchmarks/attacks.py [--robots 20] [--seconds 40] [--ways NAME ...] [--shapes 100]
 
 `fcslam serve` runs on this machine with tokens and without TLS. Robots ask for their news once a second, each with its
 token and over a connection of its own. One more robot begins a session again and again, and waits for the first
@@ -13,6 +13,10 @@ Ways
 - costly packets: keyscans with all their beams, as many as the service takes
 - reads: 40 connections that ask for the robot's state without pause
 - mixed: 40 connections with requests of random methods, paths, headers, lengths and pauses, cut at random bytes
+
+Then a fuzzer draws shapes of requests: how many connections, method, path, headers, announced and real length, pieces
+and pauses, requests at once on a connection, and what is read of the answer. Each attacks for five seconds while the
+robots send keyscans twice a second. In the end, the service must have all of them.
 """
 
 import asyncio
@@ -23,6 +27,7 @@ import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import common
 import httpx
@@ -41,6 +46,13 @@ COLUMNS = {
     "way": "", "robots": "d", "requests": ",d", "lost": "d", "median, ms": ".1f", "99 %, ms": ".1f",
     "most, ms": ".1f", "effects": "d", "effect, median, s": ".2f", "effect, most, s": ".2f",
 }  # fmt: skip
+SHAPES = {
+    "connections": "d", "request": "", "body, bytes": "", "pieces, bytes": ",d", "pause, s": ".3f", "at once": "d",
+    "reads": "", "requests": "d", "99 %, ms": ".1f", "most, ms": ".1f",
+}  # fmt: skip
+TOGETHER = {"shapes": "d", "requests": ",d", "lost": "d", "packets": ",d", "packets lost": "d", "99 %, ms": ".1f",
+            "most, ms": ".1f", "shapes with 99 % over 500 ms": "d"}  # fmt: skip
+SHAPE_S, WORST_SHOWN = 5.0, 10
 HOST = "127.0.0.1"
 HOSTILE, MEASURED = "robot0", "robot1"
 UNFINISHED, CONNECTIONS, BATCH = 4300, 40, 500
@@ -53,6 +65,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=40.0, help="of each measurement")
     parser.add_argument("--ways", nargs="+", choices=["none", *WAYS], default=["none", *WAYS])
+    parser.add_argument("--shapes", type=int, default=100, help="of requests that the fuzzer draws")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__, chosen)
     rows = []
@@ -60,7 +73,12 @@ def main() -> None:
         for way in chosen.ways:
             rows.append((way, chosen.robots, *measured(Path(place) / way.replace(" ", "-"), way, chosen)))
             print(*rows[-1], flush=True)
+        if chosen.shapes:
+            together, each = fuzzed(Path(place) / "fuzzer", chosen.robots, chosen.shapes)
     report.table("Requests and packets of other robots", COLUMNS, rows)
+    if chosen.shapes:
+        report.table("Under all shapes of the fuzzer", TOGETHER, [together])
+        report.table("Shapes with the longest requests", SHAPES, sorted(each, key=lambda row: -row[-2])[:WORST_SHOWN])
     report.write()
 
 
@@ -82,6 +100,153 @@ def measured(place: Path, way: str, chosen: object) -> tuple[object, ...]:
         (took_s, failed), effects_s = asyncio.run(both())
     quantiles = 1e3 * np.quantile(took_s, (0.5, 0.99, 1.0))
     return len(took_s), failed, *quantiles.tolist(), len(effects_s), float(np.median(effects_s)), max(effects_s)
+
+
+class Shape(NamedTuple):
+    """What one way of the fuzzer sends, again and again."""
+
+    connections: int
+    method: str
+    path: str
+    headers: bytes
+    length: int
+    """What is announced; -1: chunks."""
+    body: bytes
+    piece: int
+    pause_s: float
+    at_once: int
+    """Requests that are sent before an answer is read."""
+    reads: str
+
+
+def drawn_shape(number: int) -> Shape:
+    """A shape of the fuzzer."""
+    rng = random.Random(number)
+    own, valid = f"/api/v1/robots/{HOSTILE}", packets(HOSTILE, 0, 0, (Hello(HOSTILE, 0, (LASER,), {}),))
+    bodies = (b"", b"abc", valid, valid[:-3], valid * 300, rng.randbytes(1 << 20), bytes(4 << 20), b"{" * 60_000)
+    body = rng.choice(bodies)
+    return Shape(
+        rng.choice((1, 8, 40, 200, 1000)),
+        rng.choice(("POST", "POST", "POST", "GET", "HEAD", "PUT", "DELETE", "?")),
+        rng.choice((f"{own}/packets", f"{own}/packets", f"{own}/state", f"{own}/map", "/", "/x" * 5000)),
+        rng.choice((b"", b"Expect: 100-continue\r\n", b"Connection: close\r\n", b"X: " + b"y" * 9000 + b"\r\n",
+                    b"".join(b"A%d: b\r\n" % k for k in range(90)), b"Content-Encoding: gzip\r\n")),
+        rng.choice((len(body), len(body), len(body), len(body) + 1000, 1 << 40, -1)),
+        body,
+        rng.choice((1, 100, 5000, 1 << 22)),
+        rng.choice((0.0, 0.0, 0.001, 0.1, 1.0)),
+        rng.choice((1, 1, 3, 100)),
+        rng.choice(("all", "all", "some", "nothing")),
+    )  # fmt: skip
+
+
+def fuzzed(place: Path, robots: int, shapes: int) -> tuple[tuple[object, ...], list[tuple[object, ...]]]:
+    """All shapes together, and each with the requests of the robots while it attacks."""
+    place.mkdir()
+    each: list[tuple[object, ...]] = []
+    took_s: list[float] = []
+    with ExitStack() as stack:
+        tokens = make_tokens(place, robots + 1)
+        _, port = stack.enter_context(cloud(place, "--credentials", place / "service"))
+        token = tokens.pop(HOSTILE)
+        senders = [Sender(port, name, one) for name, one in tokens.items()]
+
+        async def all_shapes() -> list[int]:
+            await send_all(senders, SHAPE_S)  # alone, so that all have their connections
+            for number in range(shapes):
+                for sender in senders:
+                    sender.took_s.clear()
+                shape = drawn_shape(number)
+                attacker = multiprocessing.Process(target=attack_by, args=(port, token, shape), daemon=True)
+                attacker.start()
+                await send_all(senders, SHAPE_S)
+                attacker.kill()
+                some = [second for sender in senders for second in sender.took_s]
+                took_s.extend(some)
+                most = 1e3 * np.quantile(some, (0.99, 1.0))
+                asked, body = f"{shape.method} {shape.path[:40]}", f"{shape.length:,} announced, {len(shape.body):,}"
+                way = (shape.connections, asked, body, shape.piece, shape.pause_s, shape.at_once, shape.reads)
+                each.append((*way, len(some), *most.tolist()))
+                print(number, *each[-1], flush=True)
+            return [await sender.stored() for sender in senders]
+
+        stored = asyncio.run(all_shapes())
+    sent, failed = sum(sender.sent for sender in senders), sum(sender.failed for sender in senders)
+    most = 1e3 * np.quantile(took_s, (0.99, 1.0))
+    slow = sum(row[-2] > 500.0 for row in each)
+    return (shapes, len(took_s), failed, sent, sent - sum(stored), *most.tolist(), slow), each
+
+
+class Sender:
+    """An honest robot that sends keyscans."""
+
+    def __init__(self, port: int, robot: str, token: str) -> None:
+        self._port, self._robot = port, robot
+        self._client = httpx.AsyncClient(headers=headers_of(token), timeout=60.0, trust_env=False)
+        self.sent, self.failed, self.took_s = 0, 0, list[float]()
+
+    async def send(self, seconds: float, delay_s: float) -> None:
+        """Send twice a second; a request whose connection was closed is sent again."""
+        await asyncio.sleep(delay_s)
+        end, url = time.perf_counter() + seconds, packets_url(self._port, self._robot)
+        while time.perf_counter() < end:
+            k, began = max(0, (self.sent - 1) // 2), time.perf_counter()
+            drive = keyscan(self._robot, k), motion(self._robot, k)
+            bodies = drive if self.sent else (Hello(self._robot, 0, (LASER,), {}), *drive)
+            batch = packets(self._robot, 0, self.sent, bodies)
+            try:
+                try:
+                    answer = await self._client.post(url, content=batch)
+                except httpx.TransportError:
+                    answer = await self._client.post(url, content=batch)
+                answer.raise_for_status()
+                self.sent += len(bodies)
+            except httpx.HTTPError:
+                self.failed += 1
+            self.took_s.append(time.perf_counter() - began)
+            await asyncio.sleep(max(0.0, began + 0.5 - time.perf_counter()))
+
+    async def stored(self) -> int:
+        """How many packets the service has without a gap."""
+        answer = await self._client.get(f"http://{HOST}:{self._port}/api/v1/robots/{self._robot}/state")
+        return int(answer.json()["next"]["0"])
+
+
+async def send_all(senders: list[Sender], seconds: float) -> None:
+    """All robots send, one after another."""
+    await asyncio.gather(*(sender.send(seconds, 0.5 * k / len(senders)) for k, sender in enumerate(senders)))
+
+
+def attack_by(port: int, token: str, shape: Shape) -> None:
+    """Attack by a shape for ever."""
+    allow_many_connections()
+    length = b"Transfer-Encoding: chunked" if shape.length < 0 else b"Content-Length: %d" % shape.length
+    head = request(token, shape.method, shape.path, 0).replace(b"Content-Length: 0", length)[:-2] + shape.headers
+    body = b"%x\r\n%s\r\n0\r\n\r\n" % (len(shape.body), shape.body) if shape.length < 0 else shape.body
+    data = (head + b"\r\n" + body) * shape.at_once if len(body) < 1 << 18 else head + b"\r\n" + body
+
+    async def once() -> None:
+        reader, writer = await asyncio.open_connection(HOST, port)
+        try:
+            for at in range(0, len(data), shape.piece):
+                writer.write(data[at : at + shape.piece])
+                await writer.drain()
+                await asyncio.sleep(shape.pause_s)
+            if shape.reads != "nothing":
+                await asyncio.wait_for(reader.read(1 << 16 if shape.reads == "all" else 1), 5.0)
+        finally:
+            writer.close()
+
+    async def again() -> None:
+        while True:
+            with suppress(OSError, TimeoutError):
+                await once()
+            await asyncio.sleep(shape.pause_s)
+
+    async def all_of_them() -> None:
+        await asyncio.gather(*(again() for _ in range(shape.connections)))
+
+    asyncio.run(all_of_them())
 
 
 async def effects(port: int, token: str, seconds: float) -> list[float]:

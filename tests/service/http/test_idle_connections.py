@@ -56,6 +56,17 @@ def test_a_connection_without_a_request_is_closed(service):
         assert time.monotonic() - began > 0.5 * protocol.IDLE_S
 
 
+def test_a_client_that_asks_again_and_again_keeps_its_connection(service):
+    """A new one would wait behind those of an attacker."""
+    ports, end = set(), time.monotonic() + 1.5 * protocol.IDLE_S
+    with httpx.Client(verify=False) as client:
+        while time.monotonic() < end:
+            answer = client.get(f"{service.url}/healthz")
+            ports.add(answer.extensions["network_stream"].get_extra_info("client_addr")[1])
+            time.sleep(1.0)
+    assert len(ports) == 1
+
+
 def trickle(connection, count):
     for _ in range(count):
         connection.sendall(b"X")

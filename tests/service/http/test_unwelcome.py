@@ -15,7 +15,7 @@ import uvicorn
 from fcslam.service.credentials import make_credentials
 from fcslam.service.http import limits
 from fcslam.service.http.authentication import Identity, Role
-from fcslam.service.http.limits import MOST_AT_ONCE, RequestLimits
+from fcslam.service.http.limits import KNOWN_AT_ONCE, RequestLimits
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
 from tests.service.http.desk import A
 
@@ -108,11 +108,11 @@ def test_requests_without_a_token_wait_for_each_other_and_addresses_take_turns()
 def test_a_token_has_a_few_requests_at_a_time_and_its_addresses_take_turns():
     async def check():
         gate = Gate()
-        await gate.ask(*[("a", "thief")] * (3 * MOST_AT_ONCE), ("a", "robot"), ("b", "b"))
-        assert gate.came == ["thief"] * MOST_AT_ONCE + ["b"], "another robot does not wait"
+        await gate.ask(*[("a", "thief")] * (3 * KNOWN_AT_ONCE), ("a", "robot"), ("b", "b"))
+        assert gate.came == ["thief"] * KNOWN_AT_ONCE + ["b"], "another robot does not wait"
         for _ in range(2):
             gate.answer.release()
-            await settle()
+        await asyncio.sleep(2.0 * KNOWN_AT_ONCE / limits.KNOWN_PER_S)
         assert "robot" in gate.came
 
     asyncio.run(check())
@@ -121,11 +121,12 @@ def test_a_token_has_a_few_requests_at_a_time_and_its_addresses_take_turns():
 def test_a_long_answer_takes_no_place_once_it_has_begun():
     async def check():
         gate = Gate()
-        asked = await gate.ask(*[("a", "x")] * MOST_AT_ONCE, ("a", "y"))
+        asked = await gate.ask(*[("a", "x")] * KNOWN_AT_ONCE, ("a", "y"))
         for one in asked:
             one.is_unfinished = True
         gate.answer.release()
-        await settle()
+        while "y" not in gate.came:
+            await asyncio.sleep(0.01)
         assert (gate.came[-1], [one.task.done() for one in asked]) == ("y", [False] * len(asked))
         for one in asked:
             one.close()
@@ -136,7 +137,7 @@ def test_a_long_answer_takes_no_place_once_it_has_begun():
 def test_of_a_token_the_request_whose_body_does_not_come_makes_room_first():
     async def check():
         gate = Gate(patience_s=0.0)
-        asked = await gate.ask(*[("a", "x")] * MOST_AT_ONCE)
+        asked = await gate.ask(*[("a", "x")] * KNOWN_AT_ONCE)
         for one in asked[2:5]:
             one.is_unfinished = True
         await gate.ask(("b", "y"))

@@ -1,21 +1,25 @@
 """The connections of the service: how many there may be, how long they may be idle, and whose certificate they show."""
 
 import asyncio
+import gc
 import resource
 import socket
 import ssl
-from collections import Counter
+import sys
+import time
+from collections import defaultdict
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from types import FrameType
-from typing import Any
+from typing import Any, ClassVar
 
 import uvicorn
 from cryptography import x509
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from fcslam.service.http.limits import CONNECTION, WAITING, WHO
+from fcslam.service.intake import TokenBuckets
 
 MOST_CONNECTIONS = 4096
 """Connections at a time."""
@@ -64,6 +68,9 @@ class GuardedServer(uvicorn.Server):
 
     def run(self, sockets: list[socket.socket] | None = None) -> None:
         """Serve until the server is stopped."""
+        sys.setswitchinterval(0.0005)  # threads that store packets wait for this one at every statement
+        gc.freeze()
+        gc.set_threshold(2000, 10, 500)  # to look through the objects of thousands of connections takes 0.3 s
         with asyncio.Runner(loop_factory=self._loop) as runner:
             runner.run(self.serve(sockets=sockets))
 
@@ -126,10 +133,12 @@ class GuardedProtocol(H11Protocol):
     holds connections would lock everybody else out.
     """
 
+    _read: ClassVar = TokenBuckets(time.monotonic, 16.0 * 2**20, 4.0 * 2**20)
+    """Bytes that are read of one token, or of all connections whose token is not known yet."""
     _stuck_since: float | None = None
     """When the client stopped to read what is sent; None: it reads."""
     _idle_since = 0.0
-    """Time of the loop when the connection was seen without a request first."""
+    """Time of the loop when the connection was made, or the newest response was complete."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """After the handshake: a client certificate, if there is one, was signed by the trusted authority."""
@@ -146,6 +155,26 @@ class GuardedProtocol(H11Protocol):
         if turn is not None and not turn.done():
             turn.set_result(False)
         super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Take a part of a request; if its sender has sent more than others may, its next parts wait in the network."""
+        super().data_received(data)
+        who = self._state.get(WHO)
+        wait_s = self._read.wait_s(
+            "" if who is None else who.name, len(data) + 2**14
+        )  # each part takes time, also a small one
+        if wait_s > 0.0 and not self.transport.is_closing():
+            self.transport.pause_reading()
+            self.loop.call_later(wait_s, self._read_on)
+
+    def _read_on(self) -> None:
+        if not self.flow.read_paused:
+            self.transport.resume_reading()
+
+    def on_response_complete(self) -> None:
+        """A client that asks again and again keeps its connection: for a new one it would wait behind others."""
+        self._idle_since = self.loop.time()
+        super().on_response_complete()
 
     def close(self) -> None:
         """Close the connection, whatever is on its way."""
@@ -197,15 +226,18 @@ class GuardedProtocol(H11Protocol):
             self.loop.call_later(_LOOK_EVERY_S, self._enforce_timeouts)
 
     def _make_room(self) -> None:
-        """Close a tenth of the connections of the holder that has most; those whose body has not come, then the oldest.
+        """Close some connections of the holder that has most: those whose body has not come, then the oldest.
 
-        To find them takes a while, so one is not enough. Without any that may be closed, it is this one.
+        To find them takes a while, so one is not enough; all requests wait while many are closed. Without any that may
+        be closed, it is this one.
         """
-        others = [e for e in self.connections if isinstance(e, GuardedProtocol) and e.may_be_closed and e is not self]
-        ((holder, count),) = Counter(each.holder for each in others).most_common(1) or [("", 0)]
-        held = [each for each in others if each.holder == holder]
-        held.sort(key=lambda each: (not each.is_unfinished, each._idle_since))
-        for each in held[: 1 + count // 10] or [self]:
+        held: defaultdict[str, list[GuardedProtocol]] = defaultdict(list)
+        for each in self.connections:
+            if isinstance(each, GuardedProtocol) and each.may_be_closed and each is not self:
+                held[each.holder].append(each)
+        most = max(held.values(), key=len, default=[self])
+        most.sort(key=lambda each: (not each.is_unfinished, each._idle_since))
+        for each in most[: 1 + len(most) // 100]:
             each.close()
 
     def _pass_connection(self, transport: asyncio.Transport) -> None:
