@@ -1,0 +1,152 @@
+"""A fleet in space: robots with 3D LiDARs, robots with 2D LiDARs, and both in one map."""
+
+import numpy as np
+import pytest
+
+from fcslam.cloud.cloud import Cloud
+from fcslam.cloud.report import keyscan_track, run_of
+from fcslam.cloud.settings import FleetConfig
+from fcslam.errors import PacketError
+from fcslam.geometry import se2, se3
+from fcslam.lidar.occupancy import OccupancyConfig
+from fcslam.mission.mission import MissionConfig, run_mission
+from fcslam.records import ClosureStatus, ReasonCode
+from fcslam.runs import open_run
+from tests.cloud.space_fleet import BASE_M, in_space, leaning, planar
+from tests.flats import BACK, ROUND, Drive, flat
+from tests.small_fleet import feed, fingerprint, in_order, map_of
+
+pytestmark = pytest.mark.slow
+
+SPACE = FleetConfig(dimensions=3)
+GROUND = {"a": leaning(0.08), "b": leaning(-0.05)}
+
+
+def sent(*robots, extra=None):
+    """Packets of robots: in capitals those with a 2D LiDAR."""
+    packets = []
+    for name in robots:
+        plane = planar(name.lower(), ord(name.lower()))
+        packets += plane if name.isupper() else in_space(plane, GROUND[name], extra if name == "b" else None)
+    return in_order(packets)
+
+
+def result_of(packets, config=SPACE):
+    return feed(Cloud(config, 0), packets).finalize()
+
+
+def reference():
+    """The starts of both robots' grounds in one map, in the plane: T_a_b (3,)."""
+    found = {robot.robot: robot.T_map_base[0] for robot in result_of(sent("A", "B"), FleetConfig()).robots}
+    return se2.between(found["a"], found["b"])
+
+
+def starts(result):
+    """T_map_ground of the first keyscan of each robot, shape (7,)."""
+    lean = {robot.robot: bool(robot.space.voxel_maps) for robot in result.robots}
+    return {
+        robot.robot: se3.compose(robot.space.T_map_base[0], se3.inverse(GROUND[robot.robot]))
+        if lean[robot.robot]
+        else robot.space.T_map_base[0]
+        for robot in result.robots
+    }
+
+
+@pytest.mark.parametrize("robots", [("a", "b"), ("A", "b"), ("a", "B"), ("A", "B")])
+def test_robots_share_one_level_map_whatever_their_lidars(robots):
+    result = result_of(sent(*robots))
+    assert map_of(result) == {"a": 0, "b": 0}
+    found = starts(result)
+    T_a_b = se3.between(found["a"], found["b"])
+    off = se2.between(reference(), se3.to_plane(T_a_b))
+    assert np.hypot(*off[:2]) < 0.04
+    assert abs(off[2]) < 0.01
+    assert abs(T_a_b[2]) < 0.05, "both stand on one floor"
+    up = se3.rotation(np.array(list(found.values())))[:, 2, 2]
+    assert np.arccos(up.clip(-1.0, 1.0)).max() < 0.02, "the map is level although bases lean"
+
+
+def test_results_depend_on_the_set_of_packets_alone():
+    packets = sent("a", "b")
+    one = result_of(packets)
+    late = Cloud(SPACE, 0)
+    for robot in ("b", "a"):
+        feed(late, [packet for packet in packets if packet.robot == robot])
+    other = late.finalize()
+    assert fingerprint(one) == fingerprint(other)
+    for a, b in zip(one.robots, other.robots, strict=True):
+        assert a.space.T_map_base.tobytes() == b.space.T_map_base.tobytes()
+
+
+def test_a_restored_fleet_goes_on_to_the_same_bytes():
+    packets = sent("a", "b")
+    whole, half = Cloud(SPACE, 0), Cloud(SPACE, 0)
+    feed(whole, packets)
+    feed(half, packets[: 2 * len(packets) // 3])
+    state = half.state()
+    again = Cloud(SPACE, 0)
+    again._packets, again._times = half._packets, half._times
+    again.restore(state)
+    feed(again, packets[2 * len(packets) // 3 :])
+    assert fingerprint(again.finalize()) == fingerprint(whole.finalize())
+
+
+def test_surfaces_in_space_that_the_other_robot_saw_through_keep_maps_apart():
+    """Shelves over the heads: no 2D LiDAR sees them, and in the plane the maps join."""
+    x, y = np.meshgrid(np.arange(-2.0, 2.0, 0.1), np.arange(-2.0, 2.0, 0.1))
+    shelves = np.concatenate([np.column_stack((x.ravel(), y.ravel(), np.full(x.size, z))) for z in (1.0, 1.3)])
+    result = result_of(sent("a", "b", extra=shelves))
+    assert map_of(result) == {"a": 0, "b": 1}
+    between = [closure for closure in result.closures if closure.i.robot != closure.j.robot]
+    assert {closure.reason.code for closure in between} & {ReasonCode.IN_FREE_SPACE, ReasonCode.NOT_ENOUGH_EXPLAINED}
+    assert all(closure.status is not ClosureStatus.ACCEPTED for closure in between)
+
+
+def test_a_robot_in_space_has_no_place_in_a_mission_in_the_plane():
+    cloud = Cloud(FleetConfig(), 0)
+    with pytest.raises(PacketError, match="sends poses in space, but the mission is in the plane"):
+        feed(cloud, sent("a"))
+
+
+def ply(data):
+    """Columns of a PLY file by name: read as its own header says, by none of our code."""
+    head, _, body = data.partition(b"end_header\n")
+    lines = head.decode().split("\n")
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
+    sizes = {"float": "<f4", "uchar": "u1"}
+    named = [(line.split()[2], sizes[line.split()[1]]) for line in lines if line.startswith("property")]
+    rows = np.frombuffer(body, np.dtype(named))
+    assert len(rows) == count
+    return rows
+
+
+def test_the_joint_map_is_a_ply_file_of_points_with_normals():
+    result = result_of(sent("a", "b"))
+    tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
+    run = run_of(result, tracks, [], "", OccupancyConfig(), with_local_maps=False, with_certificates=False)
+    rows = ply(run.map_files["map.ply"])
+    heights = rows["z"].astype(float)
+    floor = rows[np.abs(rows["nz"]) > 0.95]
+    low = np.median(floor["z"][floor["z"] < 0.0])
+    assert low == pytest.approx(-BASE_M, abs=0.03), "the first base is the origin"
+    assert heights.max() - low == pytest.approx(1.95, abs=0.15)
+    assert (floor["nz"][floor["z"] < low + 0.2] > 0.0).all(), "the floor faces the scanner"
+    walls = rows[(heights > low + 0.5) & (heights < low + 1.5)]
+    assert np.median(np.abs(walls["nz"])) < 0.1
+    bright = rows["green"][np.argsort(heights)].astype(int)
+    assert bright[: len(bright) // 10].mean() < bright[-len(bright) // 10 :].mean()
+
+
+def test_a_run_in_space_keeps_its_six_degrees_of_freedom(tmp_path):
+    recordings = Drive("a", ROUND, flat(), 0), Drive("b", BACK, flat(), 1)
+    run = run_mission(recordings, MissionConfig(fleet=SPACE))
+    run.save(tmp_path / "run")
+    read = open_run(tmp_path / "run")
+    for name, trajectory in run.trajectories.items():
+        lines = np.loadtxt(tmp_path / "run" / "trajectories" / f"{name}.tum")
+        np.testing.assert_allclose(lines[:, 1:], trajectory.T_map_base_6d, atol=1e-9)
+        np.testing.assert_allclose(read.trajectories[name].T_map_base, trajectory.T_map_base, atol=1e-8)
+    assert run.pose_graph_g2o.startswith("VERTEX_SE3:QUAT 0 ")
+    assert {"map.pgm", "map.yaml", "map.png"} <= run.map_files.keys()
+    assert "map.ply" not in run.map_files, "no robot sent a voxel map"
