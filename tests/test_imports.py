@@ -31,6 +31,7 @@ ROOMS = [
     "sources",
     "graph",
     "lidar",
+    "lidar3d",
     "cluster",
     "features",
     "maps",

@@ -259,7 +259,27 @@ class GnssFix:
     """Position of the antenna in ``base``, metres."""
 
 
-SensorRecord = LaserScan | Odometry | CameraImage | GnssFix
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudScan:
+    """One turn of a 3D LiDAR, with the motion that other sensors measured since the turn before."""
+
+    stamp: float
+    points_m: NDArray[np.float32]
+    """Returns, shape (N, 3), each in ``base`` at its own time."""
+    times_s: NDArray[np.float32]
+    """Time of each return after the stamp, shape (N,); zeros: all were measured at the stamp."""
+    origin_m: FloatArray
+    """Position of the sensor in ``base``, shape (3,)."""
+    wheels: FloatArray
+    """Readings of the odometry since the turn before, shape (K, 4): stamp, x, y and heading; none without odometry."""
+    imu: FloatArray
+    """Readings of an IMU since the turn before, shape (M, 7): stamp, angular velocity, and specific force, in the axes
+    of ``base``; none without an IMU."""
+    new_floor: str = ""
+    """As in ``LaserScan``."""
+
+
+SensorRecord = LaserScan | Odometry | CameraImage | GnssFix | CloudScan
 """A record of one of a robot's sensors."""
 
 

@@ -7,20 +7,23 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import cycle
-from typing import Any, Final
+from itertools import chain, cycle, islice
+from typing import TYPE_CHECKING, Any, Final
 
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import FcslamError, InputError
 from fcslam.processes import Stream, semaphore, trim_memory
-from fcslam.records import Keyscan, LaserScan, Odometry
-from fcslam.robot.backend_runner import backend_process
+from fcslam.records import CloudScan, Keyscan, LaserScan, Odometry, SensorRecord
+from fcslam.robot.backend_runner import Submit, backend_process
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.track import ScanTrack
 from fcslam.sources import Source
 from fcslam.sources.faults import Fault, Faults
 from fcslam.wire.packets import SizedPacket, decode, measure, readdress
+
+if TYPE_CHECKING:
+    from fcslam.robot.frontend3d import RobotFrontend3d
 
 SCANS_PER_LEG: Final = 50
 LEGS_PER_TRIM: Final = 4
@@ -54,7 +57,7 @@ Drive = Callable[[Sequence[Source], RobotConfig], AbstractContextManager[Sequenc
 
 def one_by_one(sources: Sequence[Source], config: RobotConfig) -> AbstractContextManager[Sequence[Iterator[Leg]]]:
     """Drive each robot in this process, as far as its next leg is asked for."""
-    return nullcontext([legs(source, RobotFrontend(source.name, config)) for source in sources])
+    return nullcontext([legs(source, config) for source in sources])
 
 
 def side_by_side(processes: int) -> Drive:
@@ -95,21 +98,24 @@ def _with_backend_beside(source: Source, config: RobotConfig) -> Iterator[Iterat
         backend = None
         with suppress(InputError):
             backend = stack.enter_context(backend_process(source.name, config))
-        yield legs(source, RobotFrontend(source.name, config, backend))
+        yield legs(source, config, backend)
 
 
-def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
-    """Drive one robot over its whole recording."""
+def legs(source: Source, config: RobotConfig, backend: Submit | None = None) -> Iterator[Leg]:
+    """Drive one robot over its whole recording; ``backend`` is that of a robot with a 2D laser."""
+    records = source.records()
+    first = list(islice(records, 1))
+    robot = front_end_of(source.name, config, first, backend)
     packets: list[SizedPacket] = []
     stamps: list[float] = []
     turns = cycle(range(LEGS_PER_TRIM))
-    for record in source.records():
+    for record in chain(first, records):
         if isinstance(record, Odometry):
             continue  # scans carry their odometry
         packets += map(measure, robot.process(record))
-        if robot.packets.backlog > MOST_WAITING:
+        if robot.backlog > MOST_WAITING:
             packets += map(measure, robot.ready(wait=True))
-        if isinstance(record, LaserScan):
+        if isinstance(record, LaserScan | CloudScan):
             stamps.append(record.stamp)
         if len(stamps) == SCANS_PER_LEG:
             yield Leg(robot.robot, tuple(packets), tuple(stamps))
@@ -117,11 +123,22 @@ def legs(source: Source, robot: RobotFrontend) -> Iterator[Leg]:
             if next(turns) == 0:
                 trim_memory()
     packets += map(measure, robot.finish())
-    if robot.packets.failure is not None:
-        raise FcslamError(f"{robot.robot}: the process of its back end failed: {robot.packets.failure}")
-    faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.odometry.jumps)
+    if robot.failure is not None:
+        raise FcslamError(f"{robot.robot}: the process of its back end failed: {robot.failure}")
+    faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.jumps)
     tracks = {session_name(robot.robot, epoch): track_of(poses) for epoch, poses in enumerate(robot.tracks)}
     yield Leg(robot.robot, tuple(packets), tuple(stamps), tracks, faults)
+
+
+def front_end_of(
+    robot: str, config: RobotConfig, first: Sequence[SensorRecord], backend: Submit | None = None
+) -> "RobotFrontend | RobotFrontend3d":
+    """The front end of a robot with these first records."""
+    if any(isinstance(record, CloudScan) for record in first):
+        from fcslam.robot.frontend3d import RobotFrontend3d
+
+        return RobotFrontend3d(robot, config)
+    return RobotFrontend(robot, config, backend)
 
 
 def continued(legs: Iterator[Leg], first_session: int) -> Iterator[Leg]:
@@ -151,7 +168,7 @@ def _work(source: Source, config: RobotConfig, turns: Any, send: Callable[[Leg],
 
     The first leg needs no turn: the cloud applies packets in the order of time, so it waits until each robot has begun.
     """
-    drive = legs(source, RobotFrontend(source.name, config))
+    drive = legs(source, config)
     send(next(drive))
     with turns:
         for leg in drive:

@@ -6,7 +6,7 @@ from copy import copy
 from dataclasses import replace
 
 from fcslam.errors import InputError, PacketError
-from fcslam.records import LaserScan, SensorRecord
+from fcslam.records import CloudScan, LaserScan, SensorRecord
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -39,11 +39,11 @@ class OnFloors:
         first_s, coming = math.nan, sorted(self._floors.items(), reverse=True)
         for record in self._source.records(scans):
             floor = ""
-            if isinstance(record, LaserScan):
+            if isinstance(record, LaserScan | CloudScan):
                 first_s = record.stamp if math.isnan(first_s) else first_s
                 while coming and record.stamp - first_s >= coming[-1][0]:
                     floor = coming.pop()[1]
-            yield replace(record, new_floor=floor) if floor and isinstance(record, LaserScan) else record
+            yield replace(record, new_floor=floor) if floor and isinstance(record, LaserScan | CloudScan) else record
 
 
 def on_floors(sources: Sequence[Source], floors: Mapping[str, str]) -> list[Source]:

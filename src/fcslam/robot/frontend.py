@@ -110,6 +110,21 @@ class RobotFrontend:
         """Path length of the present session up to its newest keyscan, metres; turns count a little."""
         return self._session.lidar.travel_m
 
+    @property
+    def backlog(self) -> int:
+        """Number of inputs that the back end has not handled yet."""
+        return self.packets.backlog
+
+    @property
+    def failure(self) -> str | None:
+        """Why the back end ended early; None if it works."""
+        return self.packets.failure
+
+    @property
+    def jumps(self) -> int:
+        """Jumps of the odometry that were bridged."""
+        return self.odometry.jumps
+
     def process(self, record: SensorRecord) -> list[Packet]:
         """Process the next record of the recording; returns the packets that are ready."""
         match record:

@@ -6,22 +6,23 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2, Group
 from fcslam.lidar.frontend import ScanPose
 from fcslam.records import FloatArray
 
 
 class ScanTrack:
     """Each scan has a fixed offset to a keyscan, and each keyscan a pose in ``odom``, the frame of the session's first
-    keyscan. It grows by 36 bytes a scan."""
+    keyscan. It grows by 36 bytes a scan in the plane; ``P`` is 3 there, and 7 in space."""
 
-    def __init__(self, floor: str = "", is_new_floor: bool = False) -> None:
+    def __init__(self, floor: str = "", is_new_floor: bool = False, group: Group = SE2) -> None:
         self.floor = floor
         """Floor of the session; empty: it has no name."""
         self.is_new_floor = is_new_floor
         """Whether the robot came to the floor with this session; otherwise it was lost there."""
         self._stamps, self._keyscans, self._T_keyscan_base = array("d"), array("i"), array("d")
-        self._T_odom_keyscan = array("d", np.zeros(3))
+        self._T_odom_keyscan = array("d", group.identity)
+        self._group, self._size = group, group.size
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -31,7 +32,7 @@ class ScanTrack:
 
     def __getitem__(self, index: int) -> ScanPose:
         number = range(len(self))[index]
-        offset = np.array(self._T_keyscan_base[3 * number : 3 * number + 3])
+        offset = np.array(self._T_keyscan_base[self._size * number : self._size * (number + 1)])
         return ScanPose(self._stamps[number], self._keyscans[number], offset)
 
     def add(self, pose: ScanPose) -> None:
@@ -45,16 +46,16 @@ class ScanTrack:
         while self._stamps and self._stamps[-1] > last_s:
             self._stamps.pop()
             self._keyscans.pop()
-            del self._T_keyscan_base[-3:]
+            del self._T_keyscan_base[-self._size :]
 
     def extend(self, motion: FloatArray) -> None:
-        """Append the next keyscan by the motion to it from the one before, shape (3,), as it is sent to the cloud."""
-        self._T_odom_keyscan.extend(se2.compose(np.array(self._T_odom_keyscan[-3:]), motion))
+        """Append the next keyscan by the motion to it from the one before, shape (P,), as it is sent to the cloud."""
+        self._T_odom_keyscan.extend(self._group.compose(np.array(self._T_odom_keyscan[-self._size :]), motion))
 
     def in_odom(self, pose: ScanPose) -> FloatArray:
-        """``T_odom_base`` of a scan whose keyscan is in this track, shape (3,), metres and radians."""
-        first = 3 * pose.keyscan
-        return se2.compose(np.array(self._T_odom_keyscan[first : first + 3]), pose.T_keyscan_base)
+        """``T_odom_base`` of a scan whose keyscan is in this track, shape (P,), metres and radians."""
+        first = self._size * pose.keyscan
+        return self._group.compose(np.array(self._T_odom_keyscan[first : first + self._size]), pose.T_keyscan_base)
 
     @property
     def stamps(self) -> FloatArray:
@@ -68,14 +69,14 @@ class ScanTrack:
 
     @property
     def T_keyscan_base(self) -> FloatArray:
-        """Pose of each scan in its keyscan's base, shape (N, 3), metres and radians."""
-        return np.array(self._T_keyscan_base).reshape(-1, 3)
+        """Pose of each scan in its keyscan's base, shape (N, P), metres and radians."""
+        return np.array(self._T_keyscan_base).reshape(-1, self._size)
 
     @property
     def T_odom_keyscan(self) -> FloatArray:
-        """Pose of each keyscan in ``odom``, shape (K, 3), metres and radians."""
-        return np.array(self._T_odom_keyscan).reshape(-1, 3)
+        """Pose of each keyscan in ``odom``, shape (K, P), metres and radians."""
+        return np.array(self._T_odom_keyscan).reshape(-1, self._size)
 
     def T_odom_base(self) -> FloatArray:
-        """Pose of each scan in ``odom``, shape (N, 3), metres and radians."""
-        return se2.compose(self.T_odom_keyscan[self.keyscans], self.T_keyscan_base)
+        """Pose of each scan in ``odom``, shape (N, P), metres and radians."""
+        return self._group.compose(self.T_odom_keyscan[self.keyscans], self.T_keyscan_base)

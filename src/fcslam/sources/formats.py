@@ -50,6 +50,10 @@ def open_fleet(
         source = open_source(path, options, name) if isinstance(path, Path) else path
         bag = bag_of(source) if isinstance(path, Path) else None
         sources += [source] if bag is None else bag.robots(name)
+    if options is not None and options.in_3d:
+        from fcslam.sources.bags.cloud_bag import in_3d
+
+        return list(map(in_3d, sources))
     return sources
 
 

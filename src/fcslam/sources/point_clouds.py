@@ -137,7 +137,7 @@ def scan_of_cloud(
     heights_m = in_base @ normal - distance_m
     xy = ((in_base - mounting.position_m) @ _levelling(normal, mounting.heading_rad).T)[:, :2]
     is_timed = len(cloud.times_s) > 0
-    turn = _turn(xy, cloud.times_s if is_timed else np.linspace(0.0, 1.0, len(xy))) if motion is None else None
+    turn = turn_of(xy, cloud.times_s if is_timed else np.linspace(0.0, 1.0, len(xy))) if motion is None else None
     count, spacing_rad = mounting.directions, tau / mounting.directions
     kept = (heights_m > band.low_m) & (heights_m < band.high_m) & outside
     kept &= np.hypot(xy[:, 0], xy[:, 1]) < FARTHEST_M
@@ -331,7 +331,7 @@ def _directions(turn: tuple[float, float, float], count: int) -> tuple[int, Swee
     return first, Sweep(first_s, last_s)
 
 
-def _turn(xy: FloatArray, times_s: FloatArray) -> tuple[float, float, float] | None:
+def turn_of(xy: FloatArray, times_s: FloatArray) -> tuple[float, float, float] | None:
     """Angle, rate and first time: the scanner looks along ``angle + rate * t`` at the time ``t`` after the stamp."""
     if len(times_s) < _SLOTS or not times_s.max() > times_s.min():
         return None

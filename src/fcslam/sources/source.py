@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 from fcslam.errors import SourceError
-from fcslam.records import CameraModel, GnssFix, LaserModel, LaserScan, SensorRecord, frozen
+from fcslam.records import CameraModel, CloudScan, GnssFix, LaserModel, LaserScan, SensorRecord, frozen
 from fcslam.sources.faults import Faults
 from fcslam.sources.pose import Pose, relative_pose
 
@@ -107,7 +107,7 @@ class Part:
         """As in Source; the first record is a scan at the identity, and records before it are dropped."""
         origin: Pose | None = None
         for record in self._whole.records(self._within(scans)):
-            if isinstance(record, GnssFix):
+            if isinstance(record, GnssFix | CloudScan):
                 yield record
                 continue
             pose: Pose | None = None if record.T_odom_base is None else tuple(record.T_odom_base.tolist())

@@ -27,6 +27,7 @@ from fcslam.sources.bags.codec import (
     COMPRESSED_IMAGE,
     FIX,
     IMAGE,
+    IMU,
     LASER_SCANS,
     NANOSECONDS,
     ODOMETRY,
@@ -57,7 +58,7 @@ _LATEST_NS: Final = int(np.iinfo(np.int64).max)
 _ROWS_AT_ONCE: Final = 256
 _KEPT: Final = (*LASER_SCANS, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
 _COUNTED: Final = (*SCANS, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
-_READ: Final = (*_COUNTED, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, FIX)
+_READ: Final = (*_COUNTED, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, FIX, IMU)
 
 
 Content = ScanMessage | OdometryReading | list[StampedTransform] | ValueError

@@ -72,15 +72,20 @@ class BagScans:
         if topic.type in LASER_SCANS:
             scan: ScanMessage = content
             return scan
-        cloud = self._cloud(message)
-        if (topic, cloud.frame) not in self._mountings:
-            clouds = list(self._some_clouds(topic, cloud.frame))
-            mounting = self._levelled(topic, clouds, self._mounting(topic, cloud.frame))
-            self._mountings[topic, cloud.frame] = mounting._replace(directions=directions_in(clouds, mounting))
-            self.notes += [f"{self._robot.bag.path}: {note}" for note in _notes_on_times(topic, clouds)]
-        return scan_of_cloud(cloud, self._mountings[topic, cloud.frame], band)
+        cloud = self.cloud(message)
+        return scan_of_cloud(cloud, self.mounting(topic, cloud.frame), band)
 
-    def _cloud(self, message: BagMessage) -> PointCloud:
+    def mounting(self, topic: Topic, frame: str) -> CloudMounting:
+        """Where the sensor with this frame sits, corrected by the floor that it sees."""
+        if (topic, frame) not in self._mountings:
+            clouds = list(self._some_clouds(topic, frame))
+            mounting = self._levelled(topic, clouds, self._mounting(topic, frame))
+            self._mountings[topic, frame] = mounting._replace(directions=directions_in(clouds, mounting))
+            self.notes += [f"{self._robot.bag.path}: {note}" for note in _notes_on_times(topic, clouds)]
+        return self._mountings[topic, frame]
+
+    def cloud(self, message: BagMessage) -> PointCloud:
+        """The points of a message; raises ValueError if it is invalid."""
         topic = message.topic
         if topic not in self._calibrations:
             info = calibration_beside(topic, self._robot.topics) if topic.type == IMAGE else None
@@ -127,7 +132,7 @@ class BagScans:
 
     def _some_clouds(self, topic: Topic, frame: str) -> Iterator[PointCloud]:
         step = max(1, min(topic.message_count, _CLOUDS_TRIED) // FIRST_MESSAGES)
-        clouds = valid(islice(self._robot.bag.read([topic]), 0, _CLOUDS_TRIED, step), self._cloud)
+        clouds = valid(islice(self._robot.bag.read([topic]), 0, _CLOUDS_TRIED, step), self.cloud)
         return (cloud for cloud in clouds if cloud.frame == frame)
 
 

@@ -20,6 +20,7 @@ SCANS = *LASER_SCANS, POINT_CLOUD, *LIVOX_CLOUDS
 COMPRESSED_IMAGE, IMAGE = "sensor_msgs/CompressedImage", "sensor_msgs/Image"
 CAMERA_INFO = "sensor_msgs/CameraInfo"
 FIX = "sensor_msgs/NavSatFix"
+IMU = "sensor_msgs/Imu"
 """Message types that are read, as ROS 1 writes them."""
 OLD_TRANSFORMS = "tf/tfMessage"
 """The name of TRANSFORMS in early ROS 1."""

@@ -65,8 +65,8 @@ class RosBag:
         self.name = name
         self.path = path
         self._notes = notes
-        self._options = options or BagOptions()
-        topics, poses = self._options.scan_topics, self._options.laser_poses
+        self.options = options or BagOptions()
+        topics, poses = self.options.scan_topics, self.options.laser_poses
         if topics and 0 < len(poses) < len(topics):
             raise SourceError(
                 f"{path}: {len(poses)} laser-pose for {len(topics)} scan-topic of --sensors; {_EACH_LASER}"
@@ -78,12 +78,12 @@ class RosBag:
     @cached_property
     def robot(self) -> BagRobot:
         """The robot whose topics are read."""
-        return self._given_robot or robot_of(self.bag, self._options)
+        return self._given_robot or robot_of(self.bag, self.options)
 
     @cached_property
     def plan(self) -> BagPlan:
         """What is read, and how."""
-        return plan_of(self.robot, self._options)
+        return plan_of(self.robot, self.options)
 
     @property
     def faults(self) -> Faults:
@@ -108,7 +108,7 @@ class RosBag:
         audit = self._audit = _audit()
         watch = ScanWatch(audit)
         rig, placeholders = self._reading.rig, self._reading.placeholders
-        correction = self._options.correction
+        correction = self.options.correction
         floors = [floor and floor.mirrored() if correction.upside_down else floor for floor in correction.floors]
         found, faults = self._fixes
         fixes = deque(found)
@@ -162,7 +162,7 @@ class RosBag:
         reader = SensorReader(plan.lasers, plan.odometry is not None, audit)
         for message in self.bag.read(plan.read_topics(with_images)):
             try:
-                items = plan.items(message, band, self._options.correction)
+                items = plan.items(message, band, self.options.correction)
             except BeamsError:
                 audit.add(Fault.BAD_BEAMS, message.number)
                 continue
@@ -186,12 +186,12 @@ class RosBag:
     @cached_property
     def _reading(self) -> _Reading:
         audit, errors, plan = _audit(), dict[str, str](), self.plan
-        tree, lasers, band = plan.tree, plan.lasers, self._options.cloud_band
+        tree, lasers, band = plan.tree, plan.lasers, self.options.cloud_band
         scans, odometry = PathSummary(), PathSummary()
         samples = [RangeSample() for _ in lasers]
         bodies = [BodySample() for _ in lasers]
         farthest_m = [laser.first.range_max_m for laser in lasers]
-        base_frame = self._options.base_frame or ""
+        base_frame = self.options.base_frame or ""
         self._count_broken_transforms(audit, errors)
         for _, entry in self._entries(audit, band, errors):
             if isinstance(entry, PosedScan):
@@ -212,7 +212,7 @@ class RosBag:
             sample.check(self.path, its, _OF_CLOUDS if recorded.is_level else _OF_SCANS)
         placeholders = tuple(sample.placeholders() for sample in samples)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
-        mountings = [_moved(mounted, self._options.correction) for mounted in self._mountings(base_frame, errors)]
+        mountings = [_moved(mounted, self.options.correction) for mounted in self._mountings(base_frame, errors)]
         radius_m = max(body.radius_m(its.T_base_laser) for body, its in zip(bodies, mountings, strict=True))
         body_notes = []
         if radius_m > band.body_radius_m:
@@ -236,7 +236,7 @@ class RosBag:
                 for laser, its_m in zip(lasers, farthest_m, strict=True)
                 if its_m == UNKNOWN_RANGE_M
             ),
-            *chain.from_iterable(laser.notes(self.path, self._options.cloud_band) for laser in lasers),
+            *chain.from_iterable(laser.notes(self.path, self.options.cloud_band) for laser in lasers),
             *plan.scans.notes,
             *body_notes,
             *chain.from_iterable(map(placeholder_note, repeat(self.path), placeholders, which)),
@@ -272,7 +272,7 @@ class RosBag:
         check_units(path, scans)
 
     def _mountings(self, base_frame: str, errors: Mapping[str, str]) -> list[Mounting]:
-        lasers, poses = self.plan.lasers, self._options.laser_poses
+        lasers, poses = self.plan.lasers, self.options.laser_poses
         if poses and len(poses) != len(lasers):
             named = ", ".join(laser.name for laser in lasers)
             raise SourceError(f"{self.path}: {len(poses)} laser-pose for the lasers {named}; {_EACH_LASER}")
@@ -295,25 +295,25 @@ class RosBag:
     @property
     def has_given_pose(self) -> bool:
         """Whether the user says how the laser is mounted, which is never corrected."""
-        return bool(self._options.laser_poses)
+        return bool(self.options.laser_poses)
 
     def corrected(self, correction: BagCorrection, notes: tuple[str, ...]) -> "RosBag":
         """The same bag, read with a correction that ``notes`` explain; the floors of an earlier one stay left out."""
         if self.has_given_pose:
             correction = replace(correction, mounting=(0.0, 0.0, 0.0), upside_down=False)
-        correction = replace(correction, floors=correction.floors or self._options.correction.floors)
-        options = replace(self._options, correction=correction)
+        correction = replace(correction, floors=correction.floors or self.options.correction.floors)
+        options = replace(self.options, correction=correction)
         return RosBag(self.path, self.name, options, (*self._notes, *notes), self.robot)
 
     def robots(self, name: str | None = None) -> "list[RosBag]":
         """The robots of the bag, or the one that is chosen, named as in it; ``name`` stands for the bag."""
-        robots = robots_of(self.bag, self._options)
-        if self._options.robot is not None or len(robots) == 1:
+        robots = robots_of(self.bag, self.options)
+        if self.options.robot is not None or len(robots) == 1:
             return [self]
         return [self._of(robot, name) for robot in robots]
 
     def _of(self, robot: BagRobot, name: str | None) -> "RosBag":
-        options, own = self._options, {slashed(topic.name) for topic in robot.topics}
+        options, own = self.options, {slashed(topic.name) for topic in robot.topics}
         lasers = [k for k, topic in enumerate(options.scan_topics) if slashed(topic) in own]
         if options.scan_topics:
             poses = tuple(options.laser_poses[k] for k in lasers if options.laser_poses)

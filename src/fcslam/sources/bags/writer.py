@@ -13,6 +13,7 @@ from fcslam.errors import InputError
 from fcslam.records import (
     CameraImage,
     CameraModel,
+    CloudScan,
     FloatArray,
     GnssFix,
     LaserScan,
@@ -119,6 +120,8 @@ class _Bag:
         if isinstance(item, GnssFix):
             self._put_fix(stamp_ns, item)
             return
+        if isinstance(item, CloudScan):
+            raise ValueError("clouds of 3D LiDARs are not written")
         if item.T_odom_base is not None and not np.isnan(item.T_odom_base).all():
             self._put_odometry(stamp_ns, item.T_odom_base)
         if isinstance(item, LaserScan):

@@ -1,0 +1,136 @@
+"""Where the floor is around a robot with a 3D LiDAR, and what a 2D laser above it would see.
+
+The floor is where wheels stand: it follows the robot over ramps. Up is the direction of gravity. Without an IMU, it is
+the normal of the floors that agree with the first one, so that a ramp does not count.
+"""
+
+from math import cos, radians
+from typing import Final
+
+import numpy as np
+
+from fcslam.compiled import njit
+from fcslam.geometry import se3
+from fcslam.records import FloatArray, LaserModel, Ranges
+
+_REACH_M, _NEAR_M = 4.0, 0.15
+"""Points of the floor at the robot: within this distance, and this height above or below where its wheels stand."""
+_FEWEST, _LEAST_EXTENT_M = 40, 0.3
+_THICKEST_M: Final = 0.04
+_SAME_FLOOR: Final = cos(radians(3.0))
+"""Floors that lean by less against the vertical are level."""
+_RATE, _FIRST_RATE = 0.02, 0.2
+"""Share of a new measurement in the vertical, at most and at least at first."""
+_BAND_M: Final = (0.2, 0.6)
+"""Heights above the floor of what a 2D laser sees."""
+_CELL_M, _CELLS = 0.5, 64
+"""Side of a cell of the heights of the floor, and cells along a side of their square."""
+_STEP_M: Final = 0.12
+"""Largest step of the floor between neighbouring cells."""
+
+
+def floor_at(points: FloatArray) -> tuple[FloatArray, float] | None:
+    """Normal (3,) and distance of the floor below the base, from points (N, 3) in ``base``; None if few show it."""
+    near = points[(np.abs(points[:, 2]) < _NEAR_M) & (np.hypot(points[:, 0], points[:, 1]) < _REACH_M)]
+    if len(near) < _FEWEST:
+        return None
+    for _ in range(2):
+        middle = near.mean(axis=0)
+        variances, axes = np.linalg.eigh(np.cov((near - middle).T))
+        normal = axes[:, 0] * np.copysign(1.0, axes[2, 0])
+        off = np.abs((near - middle) @ normal)
+        near = near[off < max(2.0 * np.sqrt(variances[0]), 0.02)]
+        if len(near) < _FEWEST or variances[1] < _LEAST_EXTENT_M**2:
+            return None
+    return None if variances[0] > _THICKEST_M**2 else (normal, float(normal @ middle))
+
+
+class Vertical:
+    """The direction of up in ``odom``."""
+
+    def __init__(self) -> None:
+        self.up = np.array([0.0, 0.0, 1.0])
+        self._count = 0
+
+    def add(self, direction: FloatArray) -> None:
+        """Take a measured direction (3,): of a floor, or of the specific force at rest."""
+        direction = direction / np.linalg.norm(direction)
+        if self._count and direction @ self.up < _SAME_FLOOR:
+            return
+        self._count += 1
+        rate = max(_RATE, min(1.0 / self._count, _FIRST_RATE if self._count > 1 else 1.0))
+        self.up = self.up + rate * (direction - self.up)
+        self.up /= np.linalg.norm(self.up)
+
+
+def levelled(T_odom_base: FloatArray, up: FloatArray, height_m: float) -> FloatArray:
+    """``T_odom_ground`` (7,): its z axis is ``up``, its x axis has the heading of the base, which is ``height_m`` above
+    its origin."""
+    forward = se3.rotation(T_odom_base)[:, 0]
+    x = forward - (forward @ up) * up
+    x /= np.linalg.norm(x)
+    matrix = np.eye(4)
+    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = x, np.cross(up, x), up
+    matrix[:3, 3] = T_odom_base[:3] - height_m * up
+    return se3.from_matrix(matrix)
+
+
+def seen_by(laser: LaserModel, points: FloatArray, around: FloatArray) -> Ranges:
+    """What a laser above the floor sees of ``points`` (N, 3) in a level frame on the floor, shape (beam_count,).
+
+    0: nothing is measured. The points ``around`` (M, 3) show the floor.
+    """
+    heights = points[:, 2] - _floor_below(points, _floor_heights(around, _CELLS, _CELL_M, _STEP_M), _CELL_M)
+    seen = points[(heights > _BAND_M[0]) & (heights < _BAND_M[1])]
+    distances = np.hypot(seen[:, 0], seen[:, 1])
+    angles = np.arctan2(seen[:, 1], seen[:, 0])
+    beams = np.rint((angles - laser.angle_min_rad) / laser.angle_increment_rad).astype(np.int64) % laser.beam_count
+    nearest = np.full(laser.beam_count, np.inf)
+    np.minimum.at(nearest, beams, distances)
+    return np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
+
+
+@njit
+def _floor_heights(points, cells, cell_m, step_m):  # type: ignore[no-untyped-def]
+    """Height of the floor in the cells around the origin, shape (cells, cells).
+
+    It spreads from the origin to the lowest points of cells that are no higher step away; other cells have the height
+    of the neighbour that was reached before.
+    """
+    half = cells // 2
+    lowest = np.full((cells, cells), np.inf)
+    for p in range(len(points)):
+        i, j = int(np.floor(points[p, 0] / cell_m)) + half, int(np.floor(points[p, 1] / cell_m)) + half
+        if 0 <= i < cells and 0 <= j < cells and points[p, 2] < lowest[i, j]:
+            lowest[i, j] = points[p, 2]
+    floor = np.full((cells, cells), np.inf)
+    queue = np.empty((cells * cells, 2), np.int64)
+    first, last = 0, 0
+    for i in range(half - 1, half + 1):
+        for j in range(half - 1, half + 1):
+            floor[i, j] = lowest[i, j] if abs(lowest[i, j]) < step_m else 0.0
+            queue[last, 0], queue[last, 1] = i, j
+            last += 1
+    while first < last:
+        i, j = queue[first]
+        first += 1
+        for k in range(4):
+            u, v = i + (k == 0) - (k == 1), j + (k == 2) - (k == 3)
+            if 0 <= u < cells and 0 <= v < cells and floor[u, v] == np.inf:
+                floor[u, v] = lowest[u, v] if abs(lowest[u, v] - floor[i, j]) < step_m else floor[i, j]
+                queue[last, 0], queue[last, 1] = u, v
+                last += 1
+    return floor
+
+
+@njit
+def _floor_below(points, floor, cell_m):  # type: ignore[no-untyped-def]
+    """Height of the floor at points (N, 3), shape (N,); beyond the cells that of the nearest one."""
+    cells = len(floor)
+    half = cells // 2
+    heights = np.empty(len(points))
+    for p in range(len(points)):
+        i = min(max(int(np.floor(points[p, 0] / cell_m)) + half, 0), cells - 1)
+        j = min(max(int(np.floor(points[p, 1] / cell_m)) + half, 0), cells - 1)
+        heights[p] = floor[i, j]
+    return heights

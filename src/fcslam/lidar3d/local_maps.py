@@ -1,0 +1,196 @@
+"""Keyframes of a robot with a 3D LiDAR, the motions between them, and local maps of several keyframes."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fcslam.geometry import se3
+from fcslam.geometry.voxels import to_steps, voxelised
+from fcslam.lidar3d.ground import Vertical, floor_at, levelled
+from fcslam.lidar3d.surfels import SurfelMap
+from fcslam.lidar3d.tracker import Tracked, fit_rigid, inverse, thinned
+from fcslam.records import FloatArray, KeyscanId, VoxelMap
+
+_STEP_M, _STEP_RAD = 0.5, 0.4
+"""Motion after which a turn of the LiDAR is a keyframe."""
+_LOCAL_MAP_M: Final = 2.5
+"""Travel from one local map to the next."""
+_REACH: Final = 6
+"""Keyframes before and after that of a local map whose points it has."""
+_CELL_M: Final = 0.1
+"""A keyframe keeps one point in each such cell."""
+_FARTHEST_M: Final = 25.0
+_DRIFT: Final = np.array([1e-3] * 3 + [5e-4] * 3)
+"""Standard deviations that every motion between keyframes has at least."""
+_APART_M: Final = 12.0
+"""Travel between two local maps of a closure, at least."""
+_NEAR_M, _DRIFT_SHARE = 3.0, 0.02
+"""Local maps closer than this, and this share of the travel between them, may show the same place."""
+_MOST_TRIED: Final = 2
+_EXPLAINED, _OVERLAP = 0.9, 0.5
+"""Shares of a closure's points: on a surface of those near one, and near a surface of all."""
+_CLOSURE_SIGMA: Final = np.array([3e-3] * 3 + [1e-3] * 3)
+_UNMEASURED: Final = np.array([1.0] * 3 + [0.3] * 3)
+"""Standard deviations of a closure where surfaces do not fix it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MappedTurn:
+    """A turn of the LiDAR that carries the graph."""
+
+    number: int
+    T_odom_base: FloatArray
+    travel_m: float
+    points: FloatArray
+    """Shape (N, 3), in ``base``."""
+    origin: FloatArray
+    """Position of the sensor in ``base``."""
+    height_m: float
+    """Height of ``base`` above the floor."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeMotion:
+    """A measured motion between two keyframes."""
+
+    i: int
+    j: int
+    T_i_j: FloatArray
+    information: FloatArray
+
+
+class Keyframes:
+    """Chooses keyframes from tracked turns, and measures the motions between them."""
+
+    def __init__(self) -> None:
+        self.newest: MappedTurn | None = None
+        self.vertical = Vertical()
+        self._covariance: FloatArray = np.zeros((6, 6))
+        """Of the pose relative to the newest keyframe."""
+
+    def add(self, tracked: Tracked, force: FloatArray | None) -> tuple[MappedTurn | None, KeyframeMotion | None]:
+        """The turn as a keyframe, with the motion from the one before, or None; ``force`` is that of the IMU."""
+        back = se3.adjoint(se3.inverse(tracked.motion))
+        predicted = back @ self._covariance @ back.T + np.diag(tracked.motion_sigma**2)
+        information = inverse(predicted) + tracked.measured
+        self._covariance = inverse(information)
+        if self.newest is None:
+            return self._keyframe(tracked, 0, 0.0, force), None
+        T = se3.between(self.newest.T_odom_base, tracked.T_odom_base)
+        tangent = se3.log(T)
+        if tracked.is_poor or (np.linalg.norm(tangent[:3]) < _STEP_M and np.linalg.norm(tangent[3:]) < _STEP_RAD):
+            return None, None
+        motion = KeyframeMotion(
+            self.newest.number,
+            self.newest.number + 1,
+            T,
+            inverse(self._covariance + np.diag(_DRIFT**2)),
+        )
+        travel_m = self.newest.travel_m + float(np.linalg.norm(T[:3]))
+        self._covariance = np.zeros((6, 6))
+        return self._keyframe(tracked, motion.j, travel_m, force), motion
+
+    def _keyframe(self, tracked: Tracked, number: int, travel_m: float, force: FloatArray | None) -> MappedTurn:
+        floor = floor_at(tracked.points)
+        rotation = se3.rotation(tracked.T_odom_base)
+        if floor is not None and (number == 0 or force is None):
+            self.vertical.add(rotation @ floor[0])
+        elif force is not None:
+            self.vertical.add(rotation @ force)
+        near = tracked.points[np.linalg.norm(tracked.points, axis=1) < _FARTHEST_M]
+        self.newest = MappedTurn(
+            number,
+            tracked.T_odom_base,
+            travel_m,
+            near[thinned(near, _CELL_M)],
+            tracked.origin,
+            0.0 if floor is None else -floor[1],
+        )
+        return self.newest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceMap:
+    """The points of several keyframes around one."""
+
+    anchor: MappedTurn
+    first: int
+    last: int
+    points: FloatArray
+    """In ``base`` of the anchor, shape (N, 3)."""
+    scans: FloatArray
+    """Row of ``origins`` for each point, shape (N,)."""
+    origins: FloatArray
+    """Where the scanner was, shape (M, 3)."""
+
+    def surfels(self) -> SurfelMap:
+        """Its surfaces."""
+        surfels = SurfelMap()
+        surfels.add(self.points, self.points - self.origins[self.scans.astype(np.int64)], 1.0)
+        return surfels
+
+    def voxel_map(self, robot: str, up: FloatArray) -> VoxelMap:
+        """The local map as it is sent; ``up`` is the vertical in ``odom``."""
+        T_odom_ground = levelled(self.anchor.T_odom_base, up, self.anchor.height_m)
+        T_base_ground = se3.between(self.anchor.T_odom_base, T_odom_ground)
+        to_ground = se3.inverse(T_base_ground)
+        origins = se3.transform(to_ground, self.origins)
+        points, seen_from = voxelised(se3.transform(to_ground, self.points), self.scans.astype(np.int64), origins)
+        identifier = KeyscanId(robot, self.anchor.number)
+        return VoxelMap(identifier, self.first, self.last, T_base_ground, points, to_steps(origins), seen_from)
+
+
+class SurfaceMaps:
+    """Makes local maps of keyframes as they come, and finds closures between them."""
+
+    def __init__(self) -> None:
+        self.recent: list[MappedTurn] = []
+        """The newest keyframes."""
+        self._maps: list[SurfaceMap] = []
+        self._next_m = 0.0
+
+    def add(self, keyframe: MappedTurn) -> SurfaceMap | None:
+        """Take the next keyframe; returns the local map that is complete with it."""
+        self.recent = [*self.recent[-2 * _REACH :], keyframe]
+        anchor = self.recent[-1 - _REACH] if len(self.recent) > _REACH else None
+        if anchor is None or anchor.travel_m < self._next_m:
+            return None
+        return self._around(anchor)
+
+    def finish(self) -> SurfaceMap | None:
+        """The last local map of a drive, if the newest keyframes are in none."""
+        rest = [each for each in self.recent if each.travel_m >= self._next_m]
+        return self._around(rest[len(rest) // 2]) if rest else None
+
+    def _around(self, anchor: MappedTurn) -> SurfaceMap:
+        self._next_m = anchor.travel_m + _LOCAL_MAP_M
+        around = [each for each in self.recent if abs(each.number - anchor.number) <= _REACH]
+        T_anchor = [se3.between(anchor.T_odom_base, each.T_odom_base) for each in around]
+        points = [se3.transform(T, each.points) for T, each in zip(T_anchor, around, strict=True)]
+        scans = np.repeat(np.arange(len(around)), [len(each) for each in points]).astype(np.float64)
+        origins = np.array([se3.transform(T, each.origin[None])[0] for T, each in zip(T_anchor, around, strict=True)])
+        return SurfaceMap(anchor, around[0].number, around[-1].number, np.concatenate(points), scans, origins)
+
+    def closures(self, new: SurfaceMap) -> list[KeyframeMotion]:
+        """Motions from earlier local maps to a new one that its surfaces confirm; then remembers it."""
+        found = []
+        for old in self._candidates(new):
+            start = se3.between(old.anchor.T_odom_base, new.anchor.T_odom_base)
+            chosen = new.points[thinned(new.points, 2.0 * _CELL_M)]
+            T, measured, on_surface, near = fit_rigid(old.surfels(), chosen, start)
+            if on_surface > _EXPLAINED * near and near > _OVERLAP * len(chosen):
+                covariance = inverse(measured + np.diag(_UNMEASURED**-2)) + np.diag(_CLOSURE_SIGMA**2)
+                found.append(KeyframeMotion(old.anchor.number, new.anchor.number, T, inverse(covariance)))
+        self._maps.append(new)
+        return found
+
+    def _candidates(self, new: SurfaceMap) -> list[SurfaceMap]:
+        at, travel_m = new.anchor.T_odom_base[:3], new.anchor.travel_m
+        near = []
+        for old in self._maps:
+            apart_m = travel_m - old.anchor.travel_m
+            distance_m = float(np.linalg.norm(old.anchor.T_odom_base[:3] - at))
+            if apart_m > _APART_M and distance_m < _NEAR_M + _DRIFT_SHARE * apart_m:
+                near.append((distance_m, old.anchor.number, old))
+        return [old for _, _, old in sorted(near, key=lambda each: each[:2])[:_MOST_TRIED]]

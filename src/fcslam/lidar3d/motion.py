@@ -1,0 +1,191 @@
+"""The motion of a robot during and between turns of its 3D LiDAR, as other sensors measure it.
+
+Wheels give the path in the plane of the floor, the gyro of an IMU all rotations. Without either, the robot goes on as
+it did. Registration then says how far this was wrong: scales of the wheels and the bias of the gyro are learned.
+"""
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from fcslam.compiled import njit
+from fcslam.geometry import se2, se3
+from fcslam.lidar.odometry import WHEELS, OdometryTrust, odometry_error
+from fcslam.records import CloudScan, FloatArray
+
+_KEPT_S: Final = 2.0
+"""Readings that are older than the begin of a turn by more are forgotten."""
+_HELD_S: Final = 0.1
+"""The newest reading counts as long as this."""
+_ACCELERATION: Final = np.array([1.0, 1.0, 1.0, 3.0, 3.0, 5.0])
+"""Standard deviation of the acceleration of a robot without other sensors, m/s^2 and rad/s^2: x, y, z, then about
+each."""
+_UNKNOWN: Final = np.array([1.0, 1.0, 0.3, 0.3, 0.3, 1.5])
+"""The same of the velocity before anything is known about it, m/s and rad/s."""
+_LIFT_SHARE, _TILT_RAD = 0.02, 0.03
+"""Standard deviations of wheels in the directions that they do not measure: height per travel; roll and pitch."""
+_GYRO_RAD, _GYRO_SHARE = 1e-3, 0.01
+"""Standard deviation of a rotation by gyro: of a turn of the LiDAR, and per radian."""
+_LEAST_M: Final = 2e-3
+_BIAS_SIGMA, _BIAS_DRIFT, _GYRO_NOISE = 0.02, 1e-4, 0.005
+"""Standard deviations of the bias of a gyro before it is learned, of its change in a turn, and of a reading, rad/s."""
+_AT_REST: Final = 1e-3
+"""Metres and radians in a turn below which a robot stands still."""
+_FEWEST_READINGS: Final = 5
+
+
+class Prediction(NamedTuple):
+    """Motion over some times."""
+
+    poses: FloatArray
+    """Pose at each time in the frame of the robot at the first, shape (K, 7)."""
+    sigma: FloatArray
+    """Standard deviations of the last, in its tangent, shape (6,)."""
+    planar: se2.Pose | None
+    """The last by wheels alone, as they measured it; None without wheels."""
+    rotation: FloatArray | None
+    """The integral of the gyro, bias included, shape (3,), radians; None without a gyro."""
+
+
+@dataclass(frozen=True, slots=True)
+class GyroBias:
+    """Bias of a gyro as a Kalman filter knows it."""
+
+    value: FloatArray
+    variance: float = _BIAS_SIGMA**2
+
+    def learn(self, measured: FloatArray, sigma: float) -> "GyroBias":
+        """Learn from a measurement of the bias, shape (3,), rad/s."""
+        variance = self.variance + _BIAS_DRIFT**2
+        gain = variance / (variance + sigma**2)
+        return GyroBias(self.value + gain * (measured - self.value), (1.0 - gain) * variance)
+
+
+class MotionSensors:
+    """The newest readings of the wheels and the IMU of a robot, and what was learned about them."""
+
+    def __init__(self) -> None:
+        self.velocity: FloatArray = np.zeros(6)
+        """Of the newest turn, m/s and rad/s in the axes of the robot."""
+        self.trust = OdometryTrust()
+        self.bias = GyroBias(np.zeros(3))
+        self._is_moving_known = False
+        self._wheels, self._imu = np.zeros((0, 4)), np.zeros((0, 7))
+
+    def add(self, scan: CloudScan) -> None:
+        """Take the readings that came with a turn."""
+        self._wheels = _newest(self._wheels, scan.wheels, scan.stamp - _KEPT_S)
+        self._imu = _newest(self._imu, scan.imu, scan.stamp - _KEPT_S)
+
+    @property
+    def force(self) -> FloatArray | None:
+        """Mean specific force over the newest readings of the IMU, shape (3,), m/s^2; None without an IMU."""
+        return self._imu[:, 4:].mean(axis=0) if len(self._imu) >= _FEWEST_READINGS else None
+
+    def predict(self, times: FloatArray) -> Prediction:
+        """The motion over ascending ``times`` (K,), seconds."""
+        spans = np.diff(times)
+        moves, turns = spans[:, None] * self.velocity[:3], spans[:, None] * self.velocity[3:]
+        length_s = times[-1] - times[0]
+        sigma = length_s * (_ACCELERATION * max(length_s, 0.05) if self._is_moving_known else _UNKNOWN)
+        planar = rotation = None
+        if _covers(self._wheels, times):
+            path = self._path(times)
+            planar = se2.motion(path[0], path[-1])
+            steps = np.array([self.trust.distance.value] * 2 + [self.trust.turn.value]) * se2.relative(path)
+            moves = np.column_stack((steps[:, :2], np.zeros(len(steps))))
+            turns = np.column_stack((np.zeros((len(steps), 2)), steps[:, 2]))
+            moved_m = float(np.hypot(*planar[:2]))
+            error = self.trust.scale(odometry_error(moved_m, abs(planar[2]), WHEELS))
+            least = _LEAST_M * min(1.0, length_s * 10.0)
+            sigma = np.array(
+                [error.position_m] * 2 + [least + _LIFT_SHARE * moved_m, *2 * [_TILT_RAD], error.heading_rad]
+            )
+        if _covers(self._imu, times):
+            integral = _integral(self._imu[:, 0], self._imu[:, 1:4], times)
+            rotation = integral[-1]
+            turns = np.diff(integral, axis=0) - spans[:, None] * self.bias.value
+            spread = np.sqrt(self.bias.variance) * length_s
+            sigma[3:] = _GYRO_RAD + spread + _GYRO_SHARE * np.linalg.norm(rotation)
+        return Prediction(_chain(moves, turns), np.maximum(sigma, 1e-5), planar, rotation)
+
+    def learn(
+        self, predicted: Prediction, motion: FloatArray, length_s: float, sigma_rad: float, is_fixed: bool
+    ) -> None:
+        """Learn from the motion (7,) that registration found for a prediction over ``length_s``.
+
+        ``sigma_rad`` is the standard deviation of its rotation; ``is_fixed`` whether the surfaces that were seen fix it
+        in every direction.
+        """
+        tangent = se3.log(motion)
+        self.velocity, self._is_moving_known = tangent / length_s, True
+        if predicted.planar is not None and is_fixed:
+            planar = predicted.planar
+            error = odometry_error(float(np.hypot(*planar[:2])), abs(planar[2]), WHEELS)
+            found = se2.motion(np.array(self.trust.motion(planar)), se3.to_plane(motion))
+            self.trust = self.trust.learn(found, error, planar)
+        if predicted.rotation is not None:
+            rests = np.linalg.norm(predicted.planar or tangent) < _AT_REST
+            turned = np.zeros(3) if rests else tangent[3:]
+            sigma = _GYRO_NOISE if rests else _GYRO_NOISE + sigma_rad / length_s
+            self.bias = self.bias.learn((predicted.rotation - turned) / length_s, sigma)
+
+    def _path(self, times: FloatArray) -> FloatArray:
+        stamps = self._wheels[:, 0]
+        headings = np.unwrap(self._wheels[:, 3])
+        return np.column_stack([np.interp(times, stamps, each) for each in (*self._wheels[:, 1:3].T, headings)])
+
+
+def _newest(old: FloatArray, new: FloatArray, since: float) -> FloatArray:
+    """Readings since a time, in the order of their stamps; a clock that steps back begins anew."""
+    if len(old) and len(new) and new[-1, 0] < old[-1, 0] - _KEPT_S:
+        old = old[:0]
+    both = np.concatenate((old[max(0, np.searchsorted(old[:, 0], since) - 1) :], new))
+    return both[np.argsort(both[:, 0], kind="stable")]
+
+
+def _covers(readings: FloatArray, times: FloatArray) -> bool:
+    if len(readings) < _FEWEST_READINGS:
+        return False
+    return bool(readings[0, 0] <= times[0] + _HELD_S and readings[-1, 0] >= times[-1] - _HELD_S)
+
+
+def _integral(stamps: FloatArray, rates: FloatArray, times: FloatArray) -> FloatArray:
+    """Integral of ``rates`` (M, 3) from the first of ``times`` (K,) to each, shape (K, 3)."""
+    areas = np.diff(stamps)[:, None] * (rates[1:] + rates[:-1]) / 2.0
+    sums = np.vstack((np.zeros(3), np.cumsum(areas, axis=0)))
+    at = np.column_stack([np.interp(times, stamps, column) for column in sums.T])
+    beyond = times[:, None] - np.clip(times, stamps[0], stamps[-1])[:, None]
+    at += beyond * np.where(beyond < 0.0, rates[0], rates[-1])
+    since: FloatArray = at - at[0]
+    return since
+
+
+@njit
+def _chain(moves, turns):  # type: ignore[no-untyped-def]
+    """Poses (K, 7) after steps: translations (K - 1, 3) and rotation vectors (K - 1, 3), each in the frame before."""
+    poses = np.zeros((len(moves) + 1, 7))
+    poses[0, 6] = 1.0
+    for k in range(len(moves)):
+        x, y, z, w = poses[k, 3:]
+        # half of the step's rotation turns its translation
+        for part in range(2):
+            rx, ry, rz = 0.5 * turns[k]
+            angle = np.sqrt(rx * rx + ry * ry + rz * rz)
+            s = 0.5 if angle < 1e-8 else np.sin(0.5 * angle) / angle
+            qx, qy, qz, qw = s * rx, s * ry, s * rz, np.cos(0.5 * angle)
+            x, y, z, w = (
+                w * qx + x * qw + y * qz - z * qy,
+                w * qy - x * qz + y * qw + z * qx,
+                w * qz + x * qy - y * qx + z * qw,
+                w * qw - x * qx - y * qy - z * qz,
+            )
+            if part == 0:
+                vx, vy, vz = moves[k]
+                cx, cy, cz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
+                poses[k + 1, 0] = poses[k, 0] + vx + w * cx + y * cz - z * cy
+                poses[k + 1, 1] = poses[k, 1] + vy + w * cy + z * cx - x * cz
+                poses[k + 1, 2] = poses[k, 2] + vz + w * cz + x * cy - y * cx
+        poses[k + 1, 3], poses[k + 1, 4], poses[k + 1, 5], poses[k + 1, 6] = x, y, z, w
+    return poses

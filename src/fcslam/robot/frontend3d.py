@@ -1,0 +1,173 @@
+"""The front end of a robot with a 3D LiDAR: turns of the LiDAR in, packets out. It knows no network.
+
+Packets are those of a robot with a 2D laser, with motions in six degrees of freedom and local maps in voxels. What a
+2D laser would see above the floor makes its keyscans.
+"""
+
+from collections import deque
+from typing import Final
+
+import numpy as np
+
+from fcslam.features.birdseye import DETECTOR_VERSION, describe
+from fcslam.geometry import se3
+from fcslam.geometry.groups import SE3
+from fcslam.lidar.frontend import ScanPose
+from fcslam.lidar.voxel_map import columns
+from fcslam.lidar3d.ground import levelled, seen_by
+from fcslam.lidar3d.local_maps import MappedTurn, Keyframes, SurfaceMap, SurfaceMaps, KeyframeMotion
+from fcslam.lidar3d.tracker import Tracked, Tracker3d
+from fcslam.records import (
+    Channel,
+    CloudScan,
+    Constraint,
+    ConstraintKind,
+    Keyscan,
+    KeyscanId,
+    Place,
+    Ranges,
+    SensorRecord,
+    frozen,
+)
+from fcslam.robot.backend import SessionConfig
+from fcslam.robot.track import ScanTrack
+from fcslam.sources.clouds_in_space import BAND_LASER
+from fcslam.sources.gate import MAX_STEP_BACK_S
+from fcslam.wire.messages import Body, Hello, Packet
+from fcslam.wire.quantisation import rounded
+
+_LOST_TURNS: Final = 20
+"""Turns in a row that the surfaces explain badly after which the robot is lost."""
+_LONGEST_GAP_S: Final = 2.0
+"""Longest time between turns over which the motion is predicted without wheels."""
+
+
+class RobotFrontend3d:
+    """Turns the sensor records of a robot into packets; the poses of all turns stay on the robot."""
+
+    def __init__(self, robot: str, config: SessionConfig, floor: str = "") -> None:
+        """Start the first session, on ``floor``; empty: it has no name."""
+        self.robot = robot
+        self.tracks: list[ScanTrack] = []
+        """Poses of the turns, by session."""
+        self.jumps, self.backlog, self.failure = 0, 0, None
+        """As in ``RobotFrontend``: turns are registered whatever the odometry says, and there is no back end."""
+        self.newest: Tracked | None = None
+        """The newest turn; None before the first."""
+        self._describes = Channel.LIDAR in config.channels
+        self._packets: deque[Packet] = deque()
+        self._time = self._stamp = self._certain_s = -np.inf
+        self._begin(ScanTrack(floor, is_new_floor=True, group=SE3))
+
+    @property
+    def scan_poses(self) -> ScanTrack:
+        """Poses of the turns of the present session."""
+        return self.tracks[-1]
+
+    @property
+    def pose(self) -> ScanPose:
+        """Pose of the newest turn."""
+        return self.scan_poses[-1]
+
+    def process(self, record: SensorRecord) -> list[Packet]:
+        """Process the next record of the recording; returns the packets that are ready."""
+        if isinstance(record, CloudScan):
+            gap_s = record.stamp - self._stamp
+            if gap_s < -MAX_STEP_BACK_S or (gap_s > _LONGEST_GAP_S and not len(record.wheels)):
+                self.begin_session()
+            if record.new_floor:
+                self.change_floor(record.new_floor)
+            self._stamp = record.stamp
+            self._track(record)
+        return self.ready()
+
+    def ready(self, wait: bool = False) -> list[Packet]:  # noqa: ARG002  nothing runs beside the front end
+        """The next packets."""
+        packets = list(self._packets)
+        self._packets.clear()
+        return packets
+
+    def begin_session(self) -> None:
+        """End the present session and begin another: the next turn is of another place."""
+        if len(self.scan_poses):
+            self._end_session()
+            self._begin(ScanTrack(self.scan_poses.floor, group=SE3))
+
+    def change_floor(self, floor: str) -> None:
+        """Go on in a new session on another floor; empty: without a name."""
+        if floor != self.scan_poses.floor:
+            self.begin_session()
+            self.scan_poses.floor, self.scan_poses.is_new_floor = floor, True
+
+    def finish(self) -> list[Packet]:
+        """End the recording; returns all packets that are left."""
+        self._end_session()
+        return self.ready()
+
+    def _begin(self, track: ScanTrack) -> None:
+        self.tracks.append(track)
+        self._tracker, self._keyframes, self._local_maps = Tracker3d(), Keyframes(), SurfaceMaps()
+        self._sequence, self._poor = 0, 0
+        self._stamp = self._certain_s = -np.inf
+
+    def _track(self, scan: CloudScan) -> None:
+        tracked = self.newest = self._tracker.track(scan)
+        self._poor = self._poor + 1 if tracked.is_poor else 0
+        if self._poor > _LOST_TURNS:
+            self.scan_poses.cut(self._certain_s)
+            self.begin_session()
+            self._stamp = scan.stamp
+            tracked = self.newest = self._tracker.track(scan)
+        if not self._poor:
+            self._certain_s = scan.stamp
+        self._time = max(self._time, scan.stamp)
+        keyframe, motion = self._keyframes.add(tracked, self._tracker.sensors.force)
+        newest = self._keyframes.newest
+        assert newest is not None  # the first turn of a session is a keyframe
+        if keyframe is not None:
+            self._map(keyframe, motion, scan.stamp)
+        T_keyframe_base = se3.between(newest.T_odom_base, tracked.T_odom_base)
+        self.scan_poses.add(ScanPose(scan.stamp, newest.number, T_keyframe_base))
+
+    def _map(self, keyframe: MappedTurn, motion: KeyframeMotion | None, stamp: float) -> None:
+        local_map = self._local_maps.add(keyframe)
+        if motion is None:
+            versions = {Channel.LIDAR: DETECTOR_VERSION} if self._describes else {}
+            self._send(Hello(self.robot, len(self.tracks) - 1, (BAND_LASER,), versions))
+        self._send(Keyscan(KeyscanId(self.robot, keyframe.number), stamp, self._band(keyframe)))
+        if motion is not None:
+            self.scan_poses.extend(motion.T_i_j)
+            self._send(self._constraint(motion, ConstraintKind.ODOMETRY))
+        if local_map is not None:
+            self._send_map(local_map)
+
+    def _band(self, keyframe: MappedTurn) -> Ranges:
+        T_odom_ground = levelled(keyframe.T_odom_base, self._keyframes.vertical.up, keyframe.height_m)
+        around = [
+            se3.transform(se3.between(T_odom_ground, each.T_odom_base), each.points) for each in self._local_maps.recent
+        ]
+        return frozen(
+            rounded(seen_by(BAND_LASER, around[-1], np.concatenate(around)), BAND_LASER.max_range_m), np.float32
+        )
+
+    def _send_map(self, local_map: SurfaceMap) -> None:
+        for closure in self._local_maps.closures(local_map):
+            self._send(self._constraint(closure, ConstraintKind.CLOSURE))
+        voxels = local_map.voxel_map(self.robot, self._keyframes.vertical.up)
+        self._send(voxels)
+        if self._describes:
+            described = describe(columns(voxels))
+            self._send(Place(voxels.id, Channel.LIDAR, DETECTOR_VERSION, local_map.first, local_map.last, *described))
+
+    def _constraint(self, motion: KeyframeMotion, kind: ConstraintKind) -> Constraint:
+        return Constraint(self.robot, motion.i, motion.j, kind, frozen(motion.T_i_j), frozen(motion.information))
+
+    def _end_session(self) -> None:
+        rest = self._local_maps.finish()
+        if rest is not None:
+            self._send_map(rest)
+
+    def _send(self, body: Body) -> None:
+        packet = Packet(self.robot, len(self.tracks) - 1, self._sequence, self._time, body)
+        self._packets.append(packet.on_floor(self.scan_poses.floor))
+        self._sequence += 1

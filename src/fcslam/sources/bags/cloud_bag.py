@@ -1,0 +1,162 @@
+"""Reads the point clouds of a ROS bag whole, for a robot with a 3D LiDAR, with its wheels and its IMU."""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property, partial
+from itertools import islice
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from fcslam.errors import SourceError
+from fcslam.records import CloudScan, FloatArray, SensorRecord
+from fcslam.sources.bags.cloud_scans import valid
+from fcslam.sources.bags.codec import LIVOX_CLOUDS, POINT_CLOUD
+from fcslam.sources.bags.container import Topic
+from fcslam.sources.bags.imu import ImuAxes, imu_of, imu_topics
+from fcslam.sources.bags.plan import BagPlan, plan_of
+from fcslam.sources.bags.robots import slashed
+from fcslam.sources.bags.rosbag import RosBag
+from fcslam.sources.bags.transforms import USUAL_BASES
+from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, reader_of
+from fcslam.sources.faults import Audit, Fault, Faults
+from fcslam.sources.gate import FIRST_MESSAGES, MAX_STEP_BACK_S, check_consistency, scan_window
+from fcslam.sources.path_summary import PathSummary
+from fcslam.sources.point_clouds import PointCloud
+from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
+
+_audit = partial(Audit, "message")
+_LONGEST_WAIT: Final = 3
+"""Clouds that wait for the readings of other sensors; beyond, these have stopped."""
+
+
+class _Readings:
+    """Readings of a sensor that no cloud has carried yet."""
+
+    def __init__(self, columns: int) -> None:
+        self._rows: list[list[float]] = []
+        self._columns = columns
+        self.newest_s = -np.inf
+
+    def add(self, row: list[float]) -> None:
+        self._rows.append(row)
+        self.newest_s = row[0]
+
+    def take(self) -> FloatArray:
+        rows, self._rows = self._rows, []
+        return np.array(rows).reshape(-1, self._columns)
+
+
+class _Waiting(NamedTuple):
+    number: int
+    cloud: PointCloud
+
+
+class CloudBag:
+    """The clouds of one robot in a bag."""
+
+    def __init__(self, bag: RosBag, options_topic: Topic) -> None:
+        """``options_topic`` has the clouds."""
+        self.name, self.path = bag.name, bag.path
+        self._bag, self._topic = bag, options_topic
+        self._audit = _audit()
+
+    @property
+    def faults(self) -> Faults:
+        """As in Source."""
+        return self._audit.faults()
+
+    @cached_property
+    def _plan(self) -> BagPlan:
+        return plan_of(self._bag.robot, replace(self._bag.options, scan_topics=(self._topic.name,)))
+
+    @cached_property
+    def _reader(self) -> tuple[CloudReader, tuple[str, ...]]:
+        plan, where = self._plan, f"{self.path}: {self._topic.name}"
+        messages = self._bag.bag.read([self._topic])
+        first = list(islice(valid(messages, plan.scans.cloud), FIRST_MESSAGES))
+        if not first:
+            raise SourceError(f"{where}: no cloud can be read; correct the driver, or copy the bag again")
+        return reader_of(first, plan.scans.mounting(self._topic, first[0].frame), where)
+
+    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+        """As in Source; clouds are counted, and not decoded."""
+        _, notes = self._reader
+        plan, track = self._plan, PathSummary()
+        for message in self._bag.bag.read(plan.odometry.topics if plan.odometry else ()):
+            for reading in next(valid([message], plan.odometry.readings), []) if plan.odometry else ():
+                track.add(reading.stamp, reading.T_odom_base)
+        first_ns, last_ns = self._bag.bag.census[self._topic].span_ns
+        count = len(range(self._topic.message_count)[scans.first : scans.end])
+        share = count / max(self._topic.message_count, 1)
+        notes = (*self._bag.bag.notes, *notes, *self._bag.robot.notes, *plan.scans.notes, *plan.odometry_notes)
+        faults = self._audit.faults()
+        return Survey(count, share * (last_ns - first_ns) * 1e-9, share * track.length_m, (BAND_LASER,), faults, notes)
+
+    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+        """As in Source; every cloud carries the readings of the other sensors."""
+        audit = self._audit = _audit()
+        count = 0
+        for _, scan in scan_window(self._scans(audit), scans, lambda _: True, audit):
+            count += 1
+            yield scan
+        if scans == WHOLE:
+            check_consistency(self.path, audit.faults(), count, count)
+
+    def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:
+        plan, (reader, _) = self._plan, self._reader
+        base_frame = self._bag.options.base_frame or next((f for f in USUAL_BASES if f in plan.tree), USUAL_BASES[-1])
+        imu = imu_topics(self._bag.robot)[:1]
+        odometry = () if plan.odometry is None else plan.odometry.topics
+        wheels, gyro, axes = _Readings(4), _Readings(7), ImuAxes(plan.tree, base_frame)
+        waiting: deque[_Waiting] = deque()
+        newest_s = -np.inf
+        for message in self._bag.bag.read([*odometry, *imu, self._topic]):
+            try:
+                if message.topic == self._topic:
+                    cloud = plan.scans.cloud(message)
+                    if -MAX_STEP_BACK_S < cloud.stamp - newest_s <= 0.0:
+                        audit.add(Fault.REPEATED_STAMP, message.number)
+                        continue
+                    newest_s = cloud.stamp
+                    waiting.append(_Waiting(message.number, cloud))
+                elif message.topic in imu:
+                    gyro.add(axes.row(imu_of(message.content, message.bag_time_ns)))
+                elif plan.odometry is not None:
+                    for reading in plan.odometry.readings(message):
+                        wheels.add([reading.stamp - plan.odometry_ahead_s, *reading.T_odom_base])
+            except ValueError:
+                audit.add(Fault.BROKEN_MESSAGE, message.number)
+            while waiting and (len(waiting) > _LONGEST_WAIT or _is_covered(waiting[0].cloud, wheels, gyro)):
+                yield from self._scan(reader, waiting.popleft(), wheels, gyro, audit)
+        while waiting:
+            yield from self._scan(reader, waiting.popleft(), wheels, gyro, audit)
+
+    @staticmethod
+    def _scan(
+        reader: CloudReader, waiting: _Waiting, wheels: _Readings, gyro: _Readings, audit: Audit
+    ) -> Iterator[tuple[int, CloudScan]]:
+        try:
+            yield waiting.number, reader.scan(waiting.cloud, wheels.take(), gyro.take())
+        except ValueError:
+            audit.add(Fault.NO_RETURN, waiting.number)
+
+
+def _is_covered(cloud: PointCloud, *sensors: _Readings) -> bool:
+    """Whether the readings of every sensor that has any reach the end of a cloud."""
+    end_s = cloud.stamp + float(cloud.times_s.max(initial=0.0))
+    return all(sensor.newest_s >= end_s or not np.isfinite(sensor.newest_s) for sensor in sensors)
+
+
+def in_3d(source: Source) -> Source:
+    """The same recording with its clouds read whole, if it has any; else as it is, for a robot with a 2D laser."""
+    if not isinstance(source, RosBag):
+        return source
+    clouds = [
+        topic for topic in source.robot.topics if topic.type in (POINT_CLOUD, *LIVOX_CLOUDS) and topic.message_count
+    ]
+    if wanted := set(map(slashed, source.options.scan_topics)):
+        clouds = [topic for topic in clouds if slashed(topic.name) in wanted]
+    best = min(clouds, key=lambda topic: (-topic.message_count, topic.name), default=None)
+    return source if best is None else CloudBag(source, best)

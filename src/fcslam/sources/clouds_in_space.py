@@ -1,0 +1,139 @@
+"""Turns of a 3D LiDAR from whatever recorded them: which points count, when each was measured, and bad recordings."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import tau
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fcslam.errors import SourceError
+from fcslam.records import CloudScan, FloatArray, LaserModel, frozen
+from fcslam.sources.point_clouds import DIRECTIONS, FARTHEST_M, CloudMounting, PointCloud, floor_in, turn_of
+
+BAND_LASER: Final = LaserModel(DIRECTIONS // 2, -np.pi, 2.0 * tau / DIRECTIONS, FARTHEST_M)
+"""The 2D laser in ``base`` that a 3D LiDAR stands for."""
+_FEWEST_POINTS: Final = 50
+_TOO_FAR_M: Final = 300.0
+"""Usual distance of points that are not in metres."""
+_ONE_RING_RAD: Final = 0.02
+"""Largest spread of the elevations of the points of one ring."""
+_OVERLAP: Final = 1.5
+"""A turn that takes longer than this many times the time between turns has wrong times."""
+_FLOOR_M, _FLOOR_SHARE = 0.15, 0.05
+"""Points this near to a plane are on it; least share of the points that are on a floor."""
+_DOUBT: Final = 5.0
+"""A floor overhead counts if it has this many times as many points as the one below."""
+
+
+@dataclass(frozen=True)
+class CloudReader:
+    """Turns clouds of one sensor into records."""
+
+    mounting: CloudMounting
+    is_timed: bool
+    """Whether the times of the points count."""
+    period_s: float
+    """Time between clouds; 0 if unknown. Without other times, points in order have equal steps of it; 0: no order."""
+
+    def scan(self, cloud: PointCloud, wheels: FloatArray, imu: FloatArray) -> CloudScan:
+        """The record of a cloud with the readings since the one before; raises ValueError if it has few points."""
+        if len(cloud.points) < _FEWEST_POINTS:
+            raise ValueError(f"{len(cloud.points)} points are not a turn of a 3D LiDAR")
+        points = cloud.points @ self.mounting.rotation.T + self.mounting.position_m
+        times: NDArray[np.float64] = np.zeros(len(points))
+        if self.is_timed and len(cloud.times_s):
+            times = cloud.times_s
+        elif self.period_s > 0.0:
+            times = np.linspace(0.0, self.period_s, len(points), endpoint=False)
+        return CloudScan(
+            cloud.stamp,
+            frozen(points, np.float32),
+            frozen(times, np.float32),
+            frozen(self.mounting.position_m),
+            frozen(wheels),
+            frozen(imu),
+        )
+
+
+def reader_of(first: Sequence[PointCloud], mounting: CloudMounting, where: str) -> tuple[CloudReader, tuple[str, ...]]:
+    """How to read clouds like the ``first`` ones of a sensor, and notes about them; messages begin with ``where``.
+
+    Raises:
+        SourceError: they cannot be mapped.
+    """
+    distances_m = [float(np.median(np.linalg.norm(cloud.points, axis=1))) for cloud in first if len(cloud.points)]
+    if not distances_m or max(len(cloud.points) for cloud in first) < _FEWEST_POINTS:
+        raise SourceError(f"{where} has hardly any points; check the driver, or choose another by --sensors scan-topic")
+    if np.median(distances_m) > _TOO_FAR_M:
+        raise SourceError(
+            f"{where}: the points are {np.median(distances_m):.0f} m away, as if in millimetres; publish them in metres"
+        )
+    if max(map(_elevations, first)) < _ONE_RING_RAD:
+        raise SourceError(f"{where} has one ring, so it is a 2D laser; map it without --3d, or with its laser scans")
+    notes = []
+    stamps = np.array([cloud.stamp for cloud in first])
+    period_s = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    lengths = [float(np.ptp(cloud.times_s)) for cloud in first if len(cloud.times_s)]
+    is_timed = bool(lengths)
+    if is_timed and period_s > 0.0 and np.median(lengths) > _OVERLAP * period_s:
+        is_timed = False
+        notes.append(
+            f"{where}: the times of the points span {np.median(lengths):.3g} s, but the clouds come every "
+            f"{period_s:.3g} s, so these times are not used; correct the driver"
+        )
+    elif not is_timed:
+        notes.append(f"{where}: the points have no times, or all the same; let the driver publish them")
+    if not is_timed:
+        turns = [
+            turn_of((cloud.points @ mounting.rotation.T)[:, :2], np.linspace(0.0, 1.0, len(cloud.points)))
+            for cloud in first
+        ]
+        if sum(turn is not None for turn in turns) * 2 <= len(turns):
+            period_s = 0.0
+        notes[-1] += (
+            "; the order of the points gives their times"
+            if period_s
+            else "; the motion during a turn is not corrected, so drive slowly"
+        )
+    if not mounting.is_height_known:
+        mounting = _on_floor(first, mounting, where)
+    below, above = _floor_shares(first, mounting)
+    if above > max(_DOUBT * below, _FLOOR_SHARE):
+        flip = np.diag([1.0, -1.0, -1.0])
+        mounting = mounting._replace(rotation=flip @ mounting.rotation)
+        notes.append(f"{where}: the floor is overhead, so the LiDAR is upside down; corrected: correct it in tf")
+    elif below < _FLOOR_SHARE and all(
+        floor_in(cloud.points @ mounting.rotation.T + mounting.position_m, mounting) is None for cloud in first
+    ):
+        notes.append(
+            f"{where}: no floor is seen where tf has it, so local maps are levelled by the IMU, or else as the LiDAR "
+            "is mounted; check its pose in tf"
+        )
+    return CloudReader(mounting, is_timed, period_s), tuple(notes)
+
+
+def _elevations(cloud: PointCloud) -> float:
+    horizontal = np.hypot(cloud.points[:, 0], cloud.points[:, 1])
+    low, high = np.quantile(np.arctan2(cloud.points[:, 2], horizontal), (0.05, 0.95)) if len(horizontal) else (0.0, 0.0)
+    return float(high - low)
+
+
+def _on_floor(first: Sequence[PointCloud], mounting: CloudMounting, where: str) -> CloudMounting:
+    """The mounting with the height above the floor that most clouds show."""
+    floors = [floor_in(cloud.points @ mounting.rotation.T + mounting.position_m, mounting) for cloud in first]
+    heights_m = [float(normal @ mounting.position_m) - distance_m for normal, distance_m in filter(None, floors)]
+    if 2 * len(heights_m) < len(first):
+        raise SourceError(
+            f"{where}: no floor is seen, so the height of the sensor is not known; publish its pose in tf"
+        )
+    position = mounting.position_m + np.array([0.0, 0.0, float(np.median(heights_m))])
+    return mounting._replace(position_m=position, is_height_known=True)
+
+
+def _floor_shares(first: Sequence[PointCloud], mounting: CloudMounting) -> tuple[float, float]:
+    """Shares of the points on a floor where the mounting has it, and mirrored at the height of the sensor."""
+    points = np.concatenate([cloud.points @ mounting.rotation.T + mounting.position_m for cloud in first])
+    overhead_m = 2.0 * mounting.position_m[2]
+    return tuple(float(np.mean(np.abs(points[:, 2] - height_m) < _FLOOR_M)) for height_m in (0.0, overhead_m))  # type: ignore[return-value]

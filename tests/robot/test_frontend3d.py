@@ -1,0 +1,81 @@
+"""The front end of a robot with a 3D LiDAR: packets that the wire accepts, tracks, closures and sessions."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fcslam.geometry import se3
+from fcslam.records import Constraint, ConstraintKind, Keyscan, Place, VoxelMap
+from fcslam.robot.backend import SessionConfig
+from fcslam.robot.frontend3d import RobotFrontend3d
+from fcslam.wire.messages import Hello
+from fcslam.wire.packets import decode, encode
+from tests.spinning_lidar import circle, drive, room
+
+
+@pytest.fixture(scope="module")
+def driven() -> tuple[RobotFrontend3d, list, np.ndarray]:
+    robot, packets, truth = RobotFrontend3d("anna", SessionConfig()), [], []
+    for scan, pose in drive(room(1), circle((6.0, 4.0), 1.6, 0.8), 130, azimuths=120):
+        packets += robot.process(scan)
+        truth.append(pose)
+    return robot, [*packets, *robot.finish()], np.array(truth)
+
+
+def test_packets_pass_the_wire_in_order(driven: tuple) -> None:
+    _, packets, _ = driven
+    assert [packet.sequence for packet in packets] == list(range(len(packets)))
+    assert isinstance(packets[0].body, Hello)
+    kinds = Counter(type(decode(encode(packet)).body) for packet in packets)
+    assert kinds[Keyscan] > 20
+    assert kinds[VoxelMap] == kinds[Place] > 3
+
+
+def test_motions_are_right_and_their_information_is_honest(driven: tuple) -> None:
+    robot, packets, truth = driven
+    stamps = {packet.body.id.number: packet.body.stamp for packet in packets if isinstance(packet.body, Keyscan)}
+    poses = {number: truth[np.searchsorted(robot.scan_poses.stamps, stamp)] for number, stamp in stamps.items()}
+    motions = [packet.body for packet in packets if isinstance(packet.body, Constraint)]
+    assert {motion.kind for motion in motions} == set(ConstraintKind)
+    errors = np.array([se3.log(se3.between(m.T_i_j, se3.between(poses[m.i], poses[m.j]))) for m in motions])
+    assert np.abs(errors[:, :3]).max() < 0.03
+    chi2 = [error @ motion.information @ error for error, motion in zip(errors, motions, strict=True)]
+    assert np.median(chi2) < 12.0
+    found = se3.between(truth[0], truth)
+    assert np.abs(se3.log(se3.between(found, robot.scan_poses.T_odom_base()))[:, :3]).max() < 0.04
+
+
+def test_a_local_map_is_level_and_its_floor_is_at_zero(driven: tuple) -> None:
+    _, packets, _ = driven
+    local = next(packet.body for packet in packets if isinstance(packet.body, VoxelMap))
+    heights = local.points_m[:, 2]
+    assert np.median(heights[np.abs(heights) < 0.2]) == pytest.approx(0.0, abs=0.03)
+    assert heights.max() == pytest.approx(3.0, abs=0.1)
+    assert local.T_base_ground == pytest.approx(se3.IDENTITY, abs=0.02)
+
+
+def test_keyscans_show_walls_where_they_are(driven: tuple) -> None:
+    _, packets, _ = driven
+    lasers = packets[0].body.lasers
+    scan = next(packet.body for packet in packets if isinstance(packet.body, Keyscan))
+    seen = scan.ranges_m > 0.0
+    angles = lasers[0].angles_rad()[seen] + np.pi / 2.0
+    x, y = 7.6 + scan.ranges_m[seen] * np.cos(angles), 4.0 + scan.ranges_m[seen] * np.sin(angles)
+    near = np.min([np.abs(x), np.abs(x - 12.0), np.abs(y), np.abs(y - 8.0)], axis=0)
+    assert seen.mean() > 0.3
+    assert np.median(near) < 0.1
+
+
+def test_a_clock_that_steps_back_begins_a_session() -> None:
+    robot = RobotFrontend3d("anna", SessionConfig())
+    packets = []
+    turns = list(drive(room(1), circle((6.0, 4.0), 0.8, 0.2), 4))
+    for shift_s in (1000.0, 0.0):
+        for scan, _ in turns:
+            moved = scan.wheels + np.array([shift_s, 0.0, 0.0, 0.0])
+            packets += robot.process(replace(scan, stamp=scan.stamp + shift_s, wheels=moved))
+    packets += robot.finish()
+    assert [len(track) for track in robot.tracks] == [4, 4]
+    assert [packet.epoch for packet in packets if isinstance(packet.body, Hello)] == [0, 1]
