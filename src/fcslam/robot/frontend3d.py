@@ -15,7 +15,7 @@ from fcslam.geometry.groups import SE3
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.voxel_map import columns
 from fcslam.lidar3d.ground import levelled, seen_by
-from fcslam.lidar3d.local_maps import MappedTurn, Keyframes, SurfaceMap, SurfaceMaps, KeyframeMotion
+from fcslam.lidar3d.local_maps import KeyframeMotion, Keyframes, MappedTurn, SurfaceMap, SurfaceMaps
 from fcslam.lidar3d.tracker import Tracked, Tracker3d
 from fcslam.records import (
     Channel,
