@@ -23,8 +23,9 @@ _OVERLAP: Final = 1.5
 """A turn that takes longer than this many times the time between turns has wrong times."""
 _FLOOR_M, _FLOOR_SHARE = 0.15, 0.05
 """Points this near to a plane are on it; least share of the points that are on a floor."""
-_DOUBT: Final = 5.0
-"""A floor overhead counts if it has this many times as many points as the one below."""
+_BELOW_SHARE, _OPENINGS = 0.1, 10.0
+"""A LiDAR that is mounted otherwise sees more points below the floor than this share; as it is, this many times fewer.
+"""
 
 
 @dataclass(frozen=True)
@@ -98,18 +99,20 @@ def reader_of(first: Sequence[PointCloud], mounting: CloudMounting, where: str) 
             else "; the motion during a turn is not corrected, so drive slowly"
         )
     if not mounting.is_height_known:
-        mounting = _on_floor(first, mounting, where)
-    below, above = _floor_shares(first, mounting)
-    if above > max(_DOUBT * below, _FLOOR_SHARE):
-        flip = np.diag([1.0, -1.0, -1.0])
-        mounting = mounting._replace(rotation=flip @ mounting.rotation)
-        notes.append(f"{where}: the floor is overhead, so the LiDAR is upside down; corrected: correct it in tf")
-    elif below < _FLOOR_SHARE and all(
+        mounting = _on_floor(first, mounting) or mounting._replace(is_height_known=True)
+    flipped = mounting._replace(rotation=np.diag([1.0, -1.0, -1.0]) @ mounting.rotation)
+    (on_floor, below), (on_other, below_other) = _shares(first, mounting), _shares(first, flipped)
+    if below > _BELOW_SHARE > _OPENINGS * below_other and on_other > _FLOOR_SHARE:
+        mounting = flipped
+        notes.append(
+            f"{where}: many points are below the floor, so the LiDAR is upside down; corrected: correct it in tf"
+        )
+    elif on_floor < _FLOOR_SHARE and all(
         floor_in(cloud.points @ mounting.rotation.T + mounting.position_m, mounting) is None for cloud in first
     ):
         notes.append(
-            f"{where}: no floor is seen where tf has it, so local maps are levelled by the IMU, or else as the LiDAR "
-            "is mounted; check its pose in tf"
+            f"{where}: no floor is seen where the mounting has it, so maps are levelled by the IMU, or else as the "
+            "LiDAR is mounted; check its pose in tf"
         )
     return CloudReader(mounting, is_timed, period_s), tuple(notes)
 
@@ -120,20 +123,17 @@ def _elevations(cloud: PointCloud) -> float:
     return float(high - low)
 
 
-def _on_floor(first: Sequence[PointCloud], mounting: CloudMounting, where: str) -> CloudMounting:
-    """The mounting with the height above the floor that most clouds show."""
+def _on_floor(first: Sequence[PointCloud], mounting: CloudMounting) -> CloudMounting | None:
+    """The mounting with the height above the floor that most clouds show; None if most show no floor."""
     floors = [floor_in(cloud.points @ mounting.rotation.T + mounting.position_m, mounting) for cloud in first]
     heights_m = [float(normal @ mounting.position_m) - distance_m for normal, distance_m in filter(None, floors)]
     if 2 * len(heights_m) < len(first):
-        raise SourceError(
-            f"{where}: no floor is seen, so the height of the sensor is not known; publish its pose in tf"
-        )
+        return None
     position = mounting.position_m + np.array([0.0, 0.0, float(np.median(heights_m))])
     return mounting._replace(position_m=position, is_height_known=True)
 
 
-def _floor_shares(first: Sequence[PointCloud], mounting: CloudMounting) -> tuple[float, float]:
-    """Shares of the points on a floor where the mounting has it, and mirrored at the height of the sensor."""
+def _shares(first: Sequence[PointCloud], mounting: CloudMounting) -> tuple[float, float]:
+    """Shares of the points on the floor, and below it."""
     points = np.concatenate([cloud.points @ mounting.rotation.T + mounting.position_m for cloud in first])
-    overhead_m = 2.0 * mounting.position_m[2]
-    return tuple(float(np.mean(np.abs(points[:, 2] - height_m) < _FLOOR_M)) for height_m in (0.0, overhead_m))  # type: ignore[return-value]
+    return float(np.mean(np.abs(points[:, 2]) < _FLOOR_M)), float(np.mean(points[:, 2] < -_FLOOR_M))

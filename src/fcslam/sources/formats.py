@@ -113,6 +113,13 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
             are given for a recording that is not a bag.
     """
     path, robot = robot_in(Path(path))
+    if os.path.isdir(path) and not is_bag(path, b""):
+        from fcslam.sources.cloud_files import CloudFolder, cloud_files
+
+        if cloud_files(path):
+            if options is None or not options.in_3d:
+                raise SourceError(f"{path}: holds clouds of a 3D LiDAR; map them with --3d")
+            return CloudFolder(path, name or _robot_name(path))
     if format_of(path) == LOG:
         if options is not None or robot is not None:
             raise SourceError(

@@ -16,7 +16,7 @@ MOST_POINTS: Final = 4_000_000
 """In one message; the largest scanners measure a tenth of it in a turn."""
 _TYPES: Final = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 """Of the values of sensor_msgs/PointField, by their number."""
-_TIMES: Final = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "timeoffset", "ts")
+TIMES: Final = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "timeoffset", "ts")
 _UNITS_S: Final = (1.0, 1e-3, 1e-6, 1e-9)
 _SHORTEST_CLOUD_S: Final = 5e-3
 """Least time between the first and the last point of a cloud; it shows the unit of the times."""
@@ -79,7 +79,7 @@ def cloud_of(
     points = points[measured]
     if times is None:
         return PointCloud(stamp, frame, points, np.empty(0))
-    return _timed(PointCloud(stamp, frame, points, np.empty(0)), times[measured], longest_s)
+    return timed(PointCloud(stamp, frame, points, np.empty(0)), times[measured], longest_s)
 
 
 def _fields(content: Any) -> tuple[FloatArray, Any]:
@@ -97,7 +97,7 @@ def _fields(content: Any) -> tuple[FloatArray, Any]:
     types = {}
     for each in content.fields:
         name = each.name
-        if name not in ("x", "y", "z", *_TIMES) or name in types:
+        if name not in ("x", "y", "z", *TIMES) or name in types:
             continue
         if not 0 < each.datatype < len(_TYPES):
             raise ValueError(f"field {name} has the datatype {each.datatype}, which does not exist")
@@ -118,13 +118,13 @@ def _fields(content: Any) -> tuple[FloatArray, Any]:
     rows = np.frombuffer(data, np.uint8, height * row_bytes).reshape(height, row_bytes)[:, : width * step]
     values = np.ascontiguousarray(rows).reshape(-1).view(layout)
     points: FloatArray = np.stack([values[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    name = next((name for name in _TIMES if name in types), None)
+    name = next((name for name in TIMES if name in types), None)
     if name is None:
         return points, None
     return points, values[name].astype(np.float64 if types[name][0].kind == "f" else np.int64)
 
 
-def _timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
+def timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
     """The cloud with the times of its points, of any usual unit and beginning; points with wrong times are left out.
 
     Times that are none in any unit, as shares of a turn, give only the order of the points.

@@ -1,0 +1,195 @@
+"""Reads folders of clouds of a 3D LiDAR, one file each turn: KITTI (.bin), PCD and PLY, in the order of their names.
+
+Times come from ``times.txt`` or ``timestamps.txt`` in the folder or above it, one for each file; else from the names of
+the files, in seconds, microseconds or nanoseconds; else turns are 0.1 s apart. Without a known mounting, ``base`` is on
+the floor below the LiDAR.
+"""
+
+from collections.abc import Iterator
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fcslam.errors import SourceError
+from fcslam.records import CloudScan, SensorRecord
+from fcslam.sources.bags.clouds import TIMES, timed
+from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, reader_of
+from fcslam.sources.faults import Audit, Fault, Faults
+from fcslam.sources.gate import FIRST_MESSAGES, scan_window
+from fcslam.sources.logs.archive import translate_errors
+from fcslam.sources.point_clouds import CloudMounting, PointCloud
+from fcslam.sources.source import WHOLE, ScanRange, Survey
+
+SUFFIXES: Final = (".bin", ".pcd", ".ply")
+_TIME_FILES: Final = ("times.txt", "timestamps.txt")
+_PERIOD_S: Final = 0.1
+_LONGEST_TURN_S: Final = 0.25
+_MOST_BYTES: Final = 1 << 28
+_UNITS: Final = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (0.0, 1.0))
+"""Least stamp in each unit, and the unit in seconds."""
+_KITTI_COLUMNS: Final = 4
+_PLY_TYPES: Final = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+
+
+def cloud_files(folder: Path) -> list[Path]:
+    """The clouds in a folder, or in that of KITTI below it; empty: it has none."""
+    for place in (folder, folder / "velodyne", folder / "velodyne_points" / "data", folder / "data"):
+        for suffix in SUFFIXES if place.is_dir() else ():
+            if files := sorted(place.glob(f"*{suffix}")):
+                return files
+    return []
+
+
+class CloudFolder:
+    """A folder of clouds as the recording of a robot with a 3D LiDAR and nothing else."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        self.name, self.path = name, path
+        self._files = cloud_files(path)
+        self._audit = Audit("file")
+
+    @property
+    def faults(self) -> Faults:
+        """As in Source."""
+        return self._audit.faults()
+
+    @cached_property
+    def _stamps(self) -> list[float]:
+        above = (self._files[0].parent, self._files[0].parent.parent, self.path)
+        for file in (place / name for place in above for name in _TIME_FILES):
+            if file.is_file():
+                lines = [line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+                if len(lines) < len(self._files):
+                    raise SourceError(
+                        f"{file}: has {len(lines)} times for {len(self._files)} clouds; give one for each"
+                    )
+                return [_seconds(line, file) for line in lines[: len(self._files)]]
+        try:
+            numbers = [float(file.stem) for file in self._files]
+        except ValueError:
+            numbers = []
+        if len(numbers) > 1 and numbers[-1] - numbers[0] > 1.5 * len(numbers):  # more than a number of each file
+            unit_s = next(unit_s for least, unit_s in _UNITS if numbers[0] >= least)
+            return [number * unit_s for number in numbers]
+        return [_PERIOD_S * number for number in range(len(self._files))]
+
+    @cached_property
+    def _reader(self) -> tuple[CloudReader, tuple[str, ...]]:
+        step = max(1, len(self._files) // FIRST_MESSAGES)
+        first = [self._cloud(number) for number in range(0, len(self._files), step)[:FIRST_MESSAGES]]
+        mounting = CloudMounting(np.eye(3), np.zeros(3), 0.0, is_height_known=False)
+        return reader_of(first, mounting, str(self.path))
+
+    def _cloud(self, number: int) -> PointCloud:
+        return read_cloud(self._files[number], self._stamps[number])
+
+    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+        """As in Source."""
+        _, notes = self._reader
+        stamps = self._stamps[scans.first : scans.end]
+        duration_s = stamps[-1] - stamps[0] if stamps else 0.0
+        return Survey(len(stamps), duration_s, 0.0, (BAND_LASER,), self._audit.faults(), notes)
+
+    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+        """As in Source."""
+        audit = self._audit = Audit("file")
+        for _, scan in scan_window(self._scans(audit), scans, lambda _: True, audit):
+            yield scan
+
+    def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:
+        (reader, _), nothing = self._reader, np.zeros((0, 7))
+        for number in range(len(self._files)):
+            try:
+                yield number + 1, reader.scan(self._cloud(number), nothing[:, :4], nothing)
+            except (SourceError, ValueError):
+                audit.add(Fault.BROKEN_MESSAGE, number + 1)
+
+
+def read_cloud(path: Path, stamp: float) -> PointCloud:
+    """The cloud in a file."""
+    with translate_errors(path), path.open("rb") as file:
+        content = file.read(_MOST_BYTES + 1)
+    if len(content) > _MOST_BYTES:
+        raise SourceError(f"{path}: is larger than any turn of a LiDAR; give one file for each turn")
+    try:
+        values = {".bin": _kitti, ".pcd": _pcd, ".ply": _ply}[path.suffix](content)
+        points = np.stack([np.asarray(values[axis], np.float64) for axis in "xyz"], axis=1)
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise SourceError(f"{path}: is not a cloud that can be read ({error}); write it anew") from error
+    measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
+    cloud = PointCloud(stamp, "", points[measured], np.empty(0))
+    name = next((name for name in TIMES if name in values), None)
+    return cloud if name is None else timed(cloud, np.asarray(values[name])[measured], _LONGEST_TURN_S)
+
+
+def _kitti(content: bytes) -> dict[str, Any]:
+    values = np.frombuffer(content, "<f4").reshape(-1, _KITTI_COLUMNS)
+    return {"x": values[:, 0], "y": values[:, 1], "z": values[:, 2]}
+
+
+def _pcd(content: bytes) -> dict[str, Any]:
+    header: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in header:
+        end = content.index(b"\n", at)
+        key, *words = content[at:end].decode("ascii", "replace").split() or ["#"]
+        header[key], at = words, end + 1
+    names, count = header["FIELDS"], int(header["POINTS"][0])
+    kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    counts = [int(each) for each in header.get("COUNT", ["1"] * len(names))]
+    layout = np.dtype(
+        [
+            (f"{name}" if name != "_" else f"_{k}", kind, (many,) if many > 1 else ())
+            for k, (name, kind, many) in enumerate(zip(names, kinds, counts, strict=True))
+        ]
+    )
+    if header["DATA"] == ["ascii"]:
+        if max(counts) > 1:
+            raise ValueError("fields of several values in text")
+        return _columns(content[at:], names, count)
+    if header["DATA"] != ["binary"]:
+        raise ValueError(f"DATA {' '.join(header['DATA'])}: convert it to binary with pcl_convert_pcd_ascii_binary")
+    rows = np.frombuffer(content, layout, count, at)
+    return {name: rows[name] for name in rows.dtype.names or ()}
+
+
+def _ply(content: bytes) -> dict[str, Any]:
+    end = content.index(b"end_header")
+    lines = [line.split() for line in content[:end].decode("ascii", "replace").splitlines()]
+    begin = content.index(b"\n", end) + 1
+    elements = [words for words in lines if words[:1] == ["element"]]
+    if lines[0] != ["ply"] or elements[0][1] != "vertex":
+        raise ValueError("no vertices come first")
+    after = lines.index(elements[0]) + 1
+    until = lines.index(elements[1]) if len(elements) > 1 else len(lines)
+    properties = [words for words in lines[after:until] if words[:1] == ["property"]]
+    names, count = [words[-1] for words in properties], int(elements[0][2])
+    order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[lines[1][1]]
+    if not order:
+        return _columns(content[begin:], names, count)
+    layout = np.dtype([(name, order + _PLY_TYPES[words[1]]) for name, words in zip(names, properties, strict=True)])
+    rows = np.frombuffer(content, layout, count, begin)
+    return {name: rows[name] for name in names}
+
+
+def _columns(text: bytes, names: list[str], count: int) -> dict[str, Any]:
+    values = np.array(text.split()[: count * len(names)], np.float64).reshape(count, len(names))
+    return dict(zip(names, values.T, strict=True))
+
+
+def _seconds(text: str, file: Path) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:  # KITTI's raw data has nanoseconds
+        return datetime.fromisoformat(text[:26]).timestamp()
+    except ValueError as error:
+        raise SourceError(f"{file}: {text!r} is not a time; give seconds, or dates as in KITTI") from error

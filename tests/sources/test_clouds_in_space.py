@@ -1,0 +1,168 @@
+"""Clouds that are read whole: from bags with wheels and an IMU, from files, and bad ones."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fcslam.errors import SourceError
+from fcslam.records import CloudScan, LaserScan, Odometry
+from fcslam.sources import BagOptions, open_fleet
+from tests.sources.bag_messages import ROS2, Said, odom, quaternion, save, scan, tf
+from tests.sources.clouds import VELODYNE, Measured, cloud, header, rotation, said, spinning, xyz
+
+START, LIDAR = 1_700_000_000.0, (0.1, 0.05, 0.4)
+IMU = "sensor_msgs/msg/Imu"
+IN_3D = BagOptions(in_3d=True)
+
+
+def pose_at(times):
+    turn = 0.8 * np.asarray(times)
+    return np.stack((0.5 * np.sin(turn), 1.5 - 0.5 * np.cos(turn), turn), axis=1)
+
+
+def imu(t, rate=(0.0, 0.0, 0.8)):
+    make = ROS2.types
+    vector, zeros = make["geometry_msgs/msg/Vector3"], np.zeros(9)
+    message = make[IMU](
+        header(ROS2, START + t, "imu"), make["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0), zeros,
+        vector(*rate), zeros, vector(0.0, 0.0, 9.81), zeros,
+    )  # fmt: skip
+    return Said("/imu", IMU, START + t, {"payload": bytes(ROS2.serialize_cdr(message, IMU))})
+
+
+def drive(layout=VELODYNE, R=None, scale=1.0, rings=16, mounting=LIDAR, tilt=None, sensors=True):
+    messages = [tf(START, "base_link", "lidar", mounting, tilt or quaternion(), topic="/tf_static")]
+    if sensors:
+        messages.append(tf(START, "base_link", "imu", (0.0, 0.0, 0.0), quaternion(roll=np.pi), topic="/tf_static"))
+        for t in np.arange(0.0, 1.6, 0.02):
+            messages += [odom(START + t, pose_at([t])[0]), imu(t, (0.0, 0.0, -0.8))]
+    for t in np.arange(0.1, 1.5, 0.1).round(3).tolist():
+        measured = spinning(lambda times, t=t: pose_at(t + times), LIDAR, R, rings=rings, columns=180)
+        measured = Measured(scale * measured.points, measured.times)
+        messages.append(said("/points", START + t, cloud(START + t, measured, layout)))
+    return messages
+
+
+def opened(tmp_path, messages, options=IN_3D):
+    (source,) = open_fleet([(save(tmp_path / "drive.mcap", messages), "anna")], options)
+    return source
+
+
+def test_clouds_carry_the_readings_of_wheels_and_imu_up_to_their_end(tmp_path):
+    source = opened(tmp_path, drive())
+    scans = list(source.records())
+    survey = source.survey()
+    assert survey.scan_count == len(scans) == 14
+    assert survey.path_length_m == pytest.approx(0.5 * 0.8 * 1.6, abs=0.02)
+    assert not source.faults
+    for each in scans:
+        assert isinstance(each, CloudScan)
+        assert each.origin_m == pytest.approx(LIDAR)
+        assert float(each.times_s.max()) == pytest.approx(0.1, abs=0.01)
+    wheels, gyro = (np.concatenate([getattr(each, name) for each in scans]) for name in ("wheels", "imu"))
+    assert (np.diff(wheels[:, 0]) > 0.0).all()
+    assert wheels[:, 1:] == pytest.approx(pose_at(wheels[:, 0] - START), abs=1e-6)
+    assert gyro[:, 3] == pytest.approx(0.8)  # the IMU is upside down, and tf says so
+    assert all(each.wheels[-1, 0] >= each.stamp + 0.09 for each in scans)
+    floor = np.abs(scans[0].points_m[:, 2]) < 0.02
+    assert 0.05 < floor.mean() < 0.6
+
+
+def test_a_robot_with_a_laser_stays_in_the_plane(tmp_path):
+    ranges = np.linspace(2.0, 3.0, 90)
+    scans = [scan(START + t, ranges + t, angle_increment=np.pi / 90) for t in np.arange(0.1, 1.5, 0.1)]
+    laser = [tf(START, "base_link", "laser", topic="/tf_static")]
+    messages = [each for each in drive() if each.topic != "/points"] + laser + scans
+    assert {type(each) for each in opened(tmp_path, messages).records()} == {LaserScan, Odometry}
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"scale": 1000.0}, "as if in millimetres; publish them in metres"),
+        ({"rings": 1}, "has one ring, so it is a 2D laser; map it without --3d"),
+    ],
+)
+def test_clouds_that_cannot_be_mapped_are_refused_in_one_line(tmp_path, changes, reason):
+    with pytest.raises(SourceError, match=reason) as refused:
+        opened(tmp_path, drive(**changes)).survey()
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "note"),
+    [
+        ({"layout": (12, xyz())}, "the points have no times.*the order of the points gives their times"),
+        ({"R": rotation(roll=np.pi)}, "the LiDAR is upside down; corrected"),
+        ({"mounting": (0.0, 0.0, 3.0)}, "no floor is seen where the mounting has it"),
+    ],
+)
+def test_what_is_wrong_with_clouds_is_said_in_one_line(tmp_path, changes, note):
+    source = opened(tmp_path, drive(**changes))
+    found = [each for each in source.survey().notes if "/points" in each]
+    assert len([each for each in found if re.search(note, each)]) == 1
+    first = next(iter(source.records()))
+    if "mounting" not in changes:
+        assert (np.abs(first.points_m[:, 2]) < 0.05).mean() > 0.05
+    assert float(np.ptp(first.times_s)) == pytest.approx(0.1, abs=0.02)
+
+
+def pcd(points, kind):
+    head = f"VERSION .7\nFIELDS x y z _\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 4\nWIDTH {len(points)}\nHEIGHT 1\n"
+    head += f"POINTS {len(points)}\nDATA {kind}\n"
+    if kind == "ascii":
+        head = head.replace(" _", "").replace("4 4 4 1", "4 4 4").replace("F U", "F").replace("1 1 1 4", "1 1 1")
+        return head.encode() + "\n".join(" ".join(map(str, row)) for row in points.tolist()).encode()
+    rows = np.zeros(len(points), [("p", "<f4", 3), ("_", "u1", 4)])
+    rows["p"] = points
+    return head.encode() + rows.tobytes()
+
+
+def ply(points, kind):
+    head = (
+        f"ply\nformat {kind} 1.0\nelement vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\n"
+    )
+    head += "element face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    if kind == "ascii":
+        return head.encode() + "\n".join(" ".join(map(str, row)) for row in points.tolist()).encode()
+    return head.encode() + points.astype(">f4" if "big" in kind else "<f4").tobytes()
+
+
+@pytest.mark.parametrize("kind", ["bin", "pcd ascii", "pcd binary", "ply ascii", "ply binary_big_endian"])
+def test_folders_of_clouds_are_recordings(tmp_path, kind):
+    suffix, _, coding = kind.partition(" ")
+    folder = tmp_path / "velodyne"
+    folder.mkdir()
+    made = []
+    for number in range(12):
+        points = spinning(lambda times, t=0.1 * number: pose_at(t + times), LIDAR, columns=90).points
+        made.append(points.astype(np.float32))
+        content = {
+            "bin": lambda p: np.column_stack((p, np.zeros(len(p)))).astype("<f4").tobytes(),
+            "pcd": lambda p: pcd(p, coding),
+            "ply": lambda p: ply(p, coding),
+        }[suffix](made[-1])
+        (folder / f"{number:06d}.{suffix}").write_bytes(content)
+    (tmp_path / "times.txt").write_text("\n".join(f"{0.1 * number:e}" for number in range(12)))
+    (source,) = open_fleet([(Path(tmp_path), "anna")], IN_3D)
+    scans = list(source.records())
+    assert [each.stamp for each in scans] == pytest.approx(0.1 * np.arange(12))
+    assert scans[3].points_m - scans[3].origin_m.astype(np.float32) == pytest.approx(made[3], abs=1e-5)
+    assert scans[3].origin_m[2] == pytest.approx(0.4, abs=0.02)
+    with pytest.raises(SourceError, match="map them with --3d"):
+        open_fleet([(Path(tmp_path), "anna")])
+
+
+def test_a_broken_file_is_left_out_and_times_must_be_there(tmp_path):
+    points = spinning(pose_at, LIDAR, columns=90).points
+    for number in range(4):
+        (tmp_path / f"{number}.ply").write_bytes(ply(points, "ascii") if number != 2 else b"ply\nnonsense")
+    (source,) = open_fleet([(Path(tmp_path), "anna")], IN_3D)
+    with pytest.raises(SourceError, match=r"2\.ply: is not a cloud that can be read"):
+        source.survey()
+    (tmp_path / "times.txt").write_text("0.0\n0.1\n")
+    (source,) = open_fleet([(Path(tmp_path), "anna")], IN_3D)
+    with pytest.raises(SourceError, match="has 2 times for 4 clouds"):
+        source.survey()
