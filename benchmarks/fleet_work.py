@@ -2,9 +2,9 @@
 
     FCSLAM_DATA=/path/to/data python benchmarks/fleet_work.py --against /path/to/checkout
 
-Each fleet is mapped once: mit-csail, cut into six robots, and simulated robots in one building. Then the clouds of both
-checkouts apply the packets of its mission, in turn, each in a process of its own that has applied them once before. CPU
-is user and system; of several repetitions the least. "In place of": the count or time of the other checkout.
+Each checkout maps each fleet once: mit-csail, cut into six robots, and simulated robots in one building. Then the
+clouds of both apply the packets of their missions, in turn, each in a process of its own that has applied them once
+before. CPU is user and system; of several repetitions the least. "In place of": that of the other checkout.
 
 - places compared: pairs of places whose descriptors were matched. Verified: pairs of submaps that were aligned.
 - maps compared: pairs of maps at the transform of a cluster. Exhaustive: those that were aligned everywhere else, too.
@@ -89,17 +89,17 @@ def main() -> None:
     chosen = parser.parse_args()
     log = common.log_path(common.recordings(f"slam-benchmark/{LOG}.clf.xz"), LOG)
     report = common.Report(__file__, __doc__, chosen)
+    checkouts = [common.REPOSITORY, *([chosen.against.resolve()] if chosen.against else [])]
     with tempfile.TemporaryDirectory() as place:
-        fleets = {f"{LOG}, {PARTS} robots": mapped(Path(place) / "cut", log, "--split", PARTS)}
+        fleets: dict[str, tuple[object, ...]] = {f"{LOG}, {PARTS} robots": (log, "--split", PARTS)}
         for robots in chosen.robots:
             name = f"{robots} simulated robots"
             options = ("--robots", robots, "--path-length", PATH_M, "--seed", 1, "--no-camera")
             folder = common.simulated(Path(place) / name, *options)
-            recordings = (folder / f"robot_{number}" for number in range(1, robots + 1))
-            fleets[name] = mapped(Path(place) / f"{name}-run", *recordings)
-        checkouts = [common.REPOSITORY, *([chosen.against.resolve()] if chosen.against else [])]
-        for name, mission in fleets.items():
-            turns = [[work(checkout, mission) for checkout in checkouts] for _ in range(chosen.repetitions)]
+            fleets[name] = tuple(folder / f"robot_{number}" for number in range(1, robots + 1))
+        for name, recordings in fleets.items():
+            missions = [mapped(checkout, Path(place) / f"run{k}", recordings) for k, checkout in enumerate(checkouts)]
+            turns = [list(map(work, checkouts, missions)) for _ in range(chosen.repetitions)]
             ours, *others = (list(each) for each in zip(*turns, strict=True))
             theirs = others[0] if others else [dict[str, float]()]
             rows = [(what, ours[0].get(what, 0), theirs[0].get(what, math.nan)) for what in COUNTS]
@@ -111,8 +111,9 @@ def main() -> None:
     report.write()
 
 
-def mapped(run: Path, *arguments: object) -> Path:
-    common.run_fcslam("map", *arguments, "--output", run)
+def mapped(checkout: Path, run: Path, arguments: tuple[object, ...]) -> Path:
+    environment = {"PYTHONPATH": str(checkout / "src")}
+    common.run_fcslam("map", *arguments, "--output", run, "--force", environment=environment)
     return run
 
 

@@ -8,6 +8,9 @@ on one core, with compiled code in the cache; two busy cores slow each other dow
 start of the process, with an empty cache, as after an installation without `fcslam tools warm-up`. With one repetition
 it takes four minutes.
 
+"Work of one robot" counts calls: scans that were matched, searches of the tracker, keyscans inserted into fields of the
+tracker and of submaps, submaps, pairs of submaps that were aligned, searches of loops, and packets encoded and decoded.
+
 "Where the time goes" samples the stack every few milliseconds of CPU, on one core. A sample counts for the folder of
 the package whose code is innermost, with the libraries that it calls. Compiled functions count for their callers.
 """
@@ -73,6 +76,40 @@ finally:
         json.dump(spent, file)
 """
 """Runs the command line and writes down the seconds of each part of the package."""
+COUNTED = """
+import collections, importlib, json, sys
+path, counts = sys.argv.pop(1), collections.Counter()
+def count(name, label):
+    module, *owners, function = name.split(":")
+    owner = importlib.import_module("fcslam." + module)
+    for each in owners:
+        owner = getattr(owner, each)
+    called = getattr(owner, function)
+    def counted(*arguments, **options):
+        counts[label] += 1
+        return called(*arguments, **options)
+    setattr(owner, function, counted)
+for name, label in json.loads(sys.argv.pop(1)):
+    count(name, label)
+from fcslam.cli import main as run
+try:
+    run(sys.argv[1:])
+finally:
+    with open(path, "w") as file:
+        json.dump(counts, file)
+"""
+"""Runs the command line and writes down how often functions were called."""
+CALLS = (
+    ("lidar.tracker:match_scan", "scans matched"),
+    ("lidar.tracker:search", "searches of the tracker"),
+    ("lidar.field:SurfelField:insert", "keyscans inserted"),
+    ("lidar.backend:build_submap", "submaps"),
+    ("lidar.closing:search", "searches of loops"),
+    ("lidar.closing:verify", "submaps aligned"),
+    ("robot.backend:OwnPlaces:motions", "places recognised"),
+    ("wire.packets:encode", "packets encoded"),
+    ("wire.packets:decode", "packets decoded"),
+)
 PATIENCE_S = 600.0
 
 
@@ -106,10 +143,18 @@ def main() -> None:
             for name, parts in (("one robot", ()), ("three robots", ("--split", 3)))
         ]
         parts = on_one_core(where_time_goes, logs["intel"], Path(place))
+        work = {
+            name: [on_one_core(calls, checkout, log, Path(place)) for checkout in checkouts]
+            for name, log in logs.items()
+        }
     columns = {"": "", "ours, s": ".2f", "theirs, s": ".2f", "ratio": ".2f"}
     report.table("CPU of one core, one robot", columns, cpu)
     report.table(f"Wall time of intel, {os.cpu_count()} cores", columns, wall)
     report.table("Until the first scan is mapped, nothing compiled", columns, [("intel", *first)])
+    for name, counted in work.items():
+        ours, theirs = (*counted, {})[:2]
+        rows = [(what, ours.get(what, 0), theirs.get(what, 0) if theirs else math.nan) for _, what in CALLS]
+        report.table(f"Work of one robot, {name}", {"": "", "ours": ",.0f", "theirs": ",.0f"}, rows)
     shares = [(part, spent / sum(parts.values())) for part, spent in sorted(parts.items(), key=lambda item: -item[1])]
     report.table("Where the time goes, intel", {"part": "", "share": ".1%"}, shares)
     report.write()
@@ -130,6 +175,18 @@ def where_time_goes(log: Path, work: Path) -> dict[str, float]:
     subprocess.run(list(map(str, command)), env=environment, stdout=silent, stderr=silent, check=True)
     parts: dict[str, float] = json.loads(noted.read_text(encoding="ascii"))
     return parts
+
+
+def calls(checkout: Path, log: Path, work: Path) -> dict[str, int]:
+    """How often `fcslam map` of a checkout calls functions, by what they do."""
+    noted = work / "calls.json"
+    command = [sys.executable, "-c", COUNTED, noted, json.dumps(CALLS)]
+    command += ["map", log, "--output", work / "run", "--force"]
+    environment = {**os.environ, "PYTHONPATH": str(checkout / "src")}
+    silent = subprocess.DEVNULL
+    subprocess.run(list(map(str, command)), env=environment, stdout=silent, stderr=silent, check=True)
+    counted: dict[str, int] = json.loads(noted.read_text(encoding="ascii"))
+    return counted
 
 
 def on_one_core(measured: Callable[..., Any], *arguments: object) -> Any:

@@ -53,16 +53,17 @@ def between(T_a_b: ArrayLike, T_a_c: ArrayLike) -> Array:
     a, c = np.asarray(T_a_b, dtype=np.float64), np.asarray(T_a_c, dtype=np.float64)
     if a.ndim == 1 and c.ndim == 1:
         return np.array(motion(a, c))
-    return compose(inverse(T_a_b), T_a_c)
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    dx, dy = c[..., 0] - a[..., 0], c[..., 1] - a[..., 1]
+    turn = wrap_angle(c[..., 2] - a[..., 2])
+    return np.stack(np.broadcast_arrays(cos * dx + sin * dy, cos * dy - sin * dx, turn), axis=-1)
 
 
 def motion(T_a_b: Array, T_a_c: Array) -> Pose:
     """``between`` of two single poses, shape (3,), as numbers."""
-    (x, y, theta), (dx, dy, turn) = T_a_b.tolist(), T_a_c.tolist()
-    cos, sin = math.cos(theta), math.sin(theta)
-    x, y, theta = -cos * x - sin * y, sin * x - cos * y, (math.pi - theta) % _TURN - math.pi
-    cos, sin = math.cos(theta), math.sin(theta)
-    return x + cos * dx - sin * dy, y + sin * dx + cos * dy, (theta + turn + math.pi) % _TURN - math.pi
+    (x, y, theta), (u, v, phi) = T_a_b.tolist(), T_a_c.tolist()
+    cos, sin, dx, dy = math.cos(theta), math.sin(theta), u - x, v - y
+    return cos * dx + sin * dy, cos * dy - sin * dx, (phi - theta + math.pi) % _TURN - math.pi
 
 
 def transform(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:

@@ -134,26 +134,28 @@ class ScanTracker:
         error = odometry_error(moved_m, turned_rad, self._odometry)
         thinned = points.thinned(POINT_SPACING_M, POINT_LIMIT)
         velocity = self._velocity_information(scan.sweep)
-        match = self._match(points, thinned, T_local_guess, error, turned_rad, velocity)
+        step_m, step_rad = moved_m - state.moved_m, turned_rad - state.turned_rad
+        is_long = step_m > LONG_STEP_M or step_rad > LONG_STEP_RAD
+        match, innovation = self._match(points, thinned, T_local_guess, error, turned_rad, velocity, is_long)
         has_jumped = contradicts = False
-        if match.explained < DOUBTFUL and self._is_long_step(T_local_guess):
-            other = self._match(points, thinned, state.T_local_base, error, turned_rad, velocity)
+        if match.explained < DOUBTFUL and is_long:
+            other, stayed = self._match(points, thinned, state.T_local_base, error, turned_rad, velocity)
             is_fixed = weakest_sigma_m(other.information) < SEARCH_SIGMA_M
             is_better = other.log_likelihood > match.log_likelihood + JUMP_GAIN
             if is_fixed and is_better and other.explained >= JUMP_SHARE:
-                match, T_local_guess, has_jumped = other, state.T_local_base, True
+                match, innovation, T_local_guess, has_jumped = other, stayed, state.T_local_base, True
         if self._odometry.is_measured:  # a prediction was right only as long as the motion went on as before
-            learned = over_steps(state.trust.scale(error), moved_m, moved_m - state.moved_m)
-            match, contradicts = resolve(
-                thinned, self._fields[0][0], T_local_guess, match, learned, turned_rad, velocity
-            )
+            learned = over_steps(state.trust.scale(error), moved_m, step_m)
+            field, fitting = self._fields[0][0], match
+            match, contradicts = resolve(thinned, field, T_local_guess, match, learned, turned_rad, velocity)
+            if match is not fitting:
+                innovation = se2.motion(T_local_guess, match.T_field_base)
         # 4. A match that explains too little is not accepted: odometry alone gives the pose.
         if match.explained < (UNSURE_SUPPORTED if self._is_unsure(error) else SUPPORTED):
             tracked = by_odometry._replace(T_local_base=T_local_guess, scan=points)
             return TrackingResult(tracked, predicted._replace(T_local_base=T_local_guess), match.explained, match.known)
         tracked = TrackedScan(match.T_field_base, match.information, points, _corrected(scan.sweep, match.velocity))
         # 5. A good match shows how far odometry can be trusted, and every match how likely scans are here.
-        innovation = se2.motion(T_local_guess, match.T_field_base)
         learns = _is_good(match, error) and not (contradicts or has_jumped)
         accepted = TrackerState(
             match.T_field_base,
@@ -211,10 +213,6 @@ class ScanTracker:
             return 0.0, 0.0, 0.0
         return se2.motion(last, scan.T_odom_base)
 
-    def _is_long_step(self, T_local_guess: FloatArray) -> bool:
-        x, y, theta = se2.motion(self._state.T_local_base, T_local_guess)
-        return math.hypot(x, y) > LONG_STEP_M or abs(theta) > LONG_STEP_RAD
-
     def _is_unsure(self, error: OdometryError) -> bool:
         return self._odometry.is_measured and self._state.trust.position * error.position_m > UNSURE_M
 
@@ -236,7 +234,9 @@ class ScanTracker:
         error: OdometryError,
         turned_rad: float,
         velocity: FloatArray,
-    ) -> ScanMatch:
+        is_long_step: bool = False,
+    ) -> tuple[ScanMatch, se2.Pose]:
+        """The match at a guess, and its pose relative to that."""
         field = self._fields[0][0]
         learned = self._state.trust.scale(error)
         if self._is_unsure(error):
@@ -249,17 +249,18 @@ class ScanTracker:
         innovation = se2.motion(T_local_guess, match.T_field_base)
         contradicts = judged_by(learned, turned_rad).mahalanobis2(innovation) >= FAR**2
         is_doubtful = match.explained < DOUBTFUL * match.known or contradicts
-        if not is_doubtful and not self._is_long_step(T_local_guess):
-            return match
+        if not is_doubtful and not is_long_step:
+            return match, innovation
         found = search(points, field, T_local_guess, SEARCH_WINDOW, visible_only=True, better_than=match.T_field_base)
         if np.array_equal(found.T_field_base, match.T_field_base):
-            return match
+            return match, innovation
         other = match_scan(thinned, field, found.T_field_base, NO_INFORMATION, velocity)
-        gain = other.log_likelihood + learned.log_likelihood(se2.motion(T_local_guess, other.T_field_base))
+        other_innovation = se2.motion(T_local_guess, other.T_field_base)
+        gain = other.log_likelihood + learned.log_likelihood(other_innovation)
         gain -= match.log_likelihood + learned.log_likelihood(innovation)
         # The best of many poses explains some points by chance.
         is_fixed = is_doubtful or weakest_sigma_m(other.information) < SEARCH_SIGMA_M
-        return other if is_fixed and gain > CLEAR_GAIN else match
+        return (other, other_innovation) if is_fixed and gain > CLEAR_GAIN else (match, innovation)
 
 
 def _likeliest(

@@ -159,9 +159,10 @@ def _scans_of(laser: LaserModel, source: Source) -> Iterator[LaserScan]:
 
 
 def _contradictions(source: Source) -> list[tuple[Contradiction | None, FloorLine | None]]:
-    found = []
-    for laser in source.survey().lasers:
-        first = list(islice(_scans_of(laser, source), MOST_COMPARED))
+    found, survey = [], source.survey()
+    most = min(MOST_COMPARED, survey.scan_count - 1)  # a log that is read to its end leaves the memory
+    for laser in survey.lasers:
+        first = list(islice(_scans_of(laser, source), most))
         found.append((contradicted_facing(first), floor_line(first)))
     return found
 

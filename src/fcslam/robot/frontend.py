@@ -278,10 +278,12 @@ class RobotFrontend:
     def _map(self, scan: LaserScan, tracking: TrackingResult) -> None:
         self.packets.advance(scan.stamp)
         due = [fix for fix in self._fixes if fix.stamp <= scan.stamp]
-        self._fixes = deque((fix for fix in self._fixes if fix.stamp > scan.stamp), maxlen=MOST_FIXES)
-        for input in self._session.map(scan, tracking, due):
+        for fix in due:
+            self._fixes.remove(fix)
+        pose, inputs = self._session.map(scan, tracking, due)
+        for input in inputs:
             self._submit(input)
-        self.newest = NewestScan(self.scan_poses[-1], tracking.tracked, tracking.quality, is_deferred=False)
+        self.newest = NewestScan(pose, tracking.tracked, tracking.quality, is_deferred=False)
 
     def _describe(self, image: CameraImage) -> None:
         view = self._session.view(image)

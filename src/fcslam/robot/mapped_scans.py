@@ -26,6 +26,8 @@ class MappedScans:
         """Beams in the sectors ``ignore`` and returns within ``footprint`` are left out."""
         self._ignore, self._footprint = ignore, footprint
         self._lasers: list[LaserModel] = []
+        self._last: tuple[LaserModel, int, LaserModel] | None = None
+        """The laser of the scan before, every which beam is mapped, and the laser with these."""
 
     def of(self, scan: LaserScan) -> LaserScan:
         """The scan as it is mapped.
@@ -34,9 +36,10 @@ class MappedScans:
         No return is inf; an invalid range, or one at the maximum, is 0. All are 0 in a scan without any return, as of
         a covered laser: it does not show that the floor is free.
         """
-        first = self._lasers[laser_index(self._lasers, scan.laser)]
-        step = beam_step(first.beams)
-        laser = _mapped_laser(scan.laser, step)
+        if self._last is None or scan.laser is not self._last[0]:
+            step = beam_step(self._lasers[laser_index(self._lasers, scan.laser)].beams)
+            self._last = scan.laser, step, _mapped_laser(scan.laser, step)
+        _, step, laser = self._last
         ranges_m = scan.ranges_m[::step]
         if self._ignore:
             ranges_m = np.where(is_in_sectors(laser, self._ignore), np.float32(0.0), ranges_m)

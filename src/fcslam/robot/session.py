@@ -89,8 +89,10 @@ class Session:
         is_measured = self.motion.model.is_measured and self.motion.jumps == self._jumps
         return is_measured and drove_on(self._explained, scans, self.lidar.odometry, self.lidar.tracker.trust)
 
-    def map(self, scan: LaserScan, tracking: TrackingResult, fixes: Iterable[GnssFix]) -> list[BackendInput]:
-        """Continue from a localized scan; returns the keyscan that it becomes, and the fixes of keyscans."""
+    def map(
+        self, scan: LaserScan, tracking: TrackingResult, fixes: Iterable[GnssFix]
+    ) -> tuple[ScanPose, list[BackendInput]]:
+        """Continue from a localized scan; returns its pose, the keyscan that it becomes, and the fixes of keyscans."""
         step = self.lidar.process(scan, tracking)
         inputs: list[BackendInput] = []
         if step.keyscan is not None:
@@ -104,7 +106,7 @@ class Session:
         if tracking.explained >= DOUBTFUL * tracking.known:  # false if it was not matched
             self._explained[scan.laser.T_base_laser] = scan
         self._jumps = self.motion.jumps
-        return inputs
+        return step.pose, inputs
 
     def view(self, image: CameraImage) -> NewImage | None:
         """An image with the newest scans; None before the first scan."""
