@@ -164,8 +164,8 @@ def test_damaged_messages_are_told_once(robot):
     robot.hears("/scan", b"no message").hears("/scan", b"nor this").drives([7.0])
     assert robot.stamps[-1] == 7.0
     assert len(robot.said) == 1
-    robot.hears("/scan", scan(8.0, RANGES, increment=0.0))
-    assert "angle_increment is 0; correct the driver" in robot.said[1]
+    other = Robot().drives(np.arange(1.0, 7.0)).hears("/scan", scan(8.0, RANGES, increment=0.0))
+    assert "angle_increment is 0); correct the driver" in other.said[0]
 
 
 def test_a_missing_mounting_says_who_could_publish_it_and_the_robot_waits():
@@ -343,7 +343,7 @@ NAN = float("nan")
 def test_a_mounting_that_is_no_rotation_is_told_and_the_right_one_counts(rotation):
     robot = Robot().hears("/tf_static", turned(transform(0.0, "base_link", "laser", (0.2, 0.0, 0.0)), **rotation))
     robot.drives(np.arange(1.0, 9.0))
-    assert robot.said == ["/tf_static: broken messages skipped"]
+    assert [line.partition(" (")[0] for line in robot.said] == ["/tf_static: broken messages skipped"]
     robot.hears("/tf_static", transform(0.0, "base_link", "laser")).drives(np.arange(9.0, 15.0))
     assert robot.stamps == list(np.arange(1.0, 15.0))
 
@@ -354,7 +354,7 @@ def test_odometry_that_is_no_pose_is_told_and_left_out(robot):
         robot.hears("/odom", odometry(stamp, (NAN, 0.0, 0.0))).drives([stamp])
     assert robot.stamps == list(np.arange(1.0, 9.0))
     assert [record.T_odom_base[0] for record in robot.records] == robot.stamps
-    assert robot.said == ["/odom: broken messages skipped"]
+    assert [line.partition(" (")[0] for line in robot.said] == ["/odom: broken messages skipped"]
 
 
 @pytest.mark.attack

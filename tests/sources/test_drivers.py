@@ -168,9 +168,7 @@ SCANNERS = {
     "depthimage_to_laserscan": Scanner(
         320, math.radians(-43.0), 86.0 / 319, hz=15.0, nothing=NAN, shortest_m=0.45, reach_m=10.0
     ),
-    "lslidar N10, range_max 0": Scanner(
-        first_rad=0.0, turns_s=-FAST, nothing=0.0, range_max=0.0, shortest_m=0.0, line="states no range_max"
-    ),
+    "lslidar N10, range_max 0": Scanner(first_rad=0.0, turns_s=-FAST, nothing=0.0, range_max=0.0, shortest_m=0.0),
     "inches": Scanner(unit=39.37, range_max=12.0 * 39.37, line=UNIT),
     "feet": Scanner(unit=1.0 / 0.3048, range_max=40.0, line="may be feet"),
     "a counter of half the time of flight": Scanner(unit=0.5, line="the robot's distance is 0.5"),

@@ -6,7 +6,7 @@ from fcslam.errors import SourceError
 from fcslam.sources import BagOptions, write_bag
 from fcslam.sources.inspection import inspect
 from tests.sources import camera_records, carmen_text
-from tests.sources.bag_messages import BEAMS, LASER_POSE, drive, mounted, odom, save, scan, text
+from tests.sources.bag_messages import BEAMS, LASER_POSE, drive, mounted, odom, save, text
 
 
 def without_tf(said):
@@ -31,7 +31,7 @@ def test_a_bag_names_its_topics_rates_and_frames(tmp_path, suffix):
     assert (laser.scans, laser.model.beam_count) == (40, BEAMS)
     assert laser.model.T_base_laser == pytest.approx(LASER_POSE)
     assert laser.rate_hz == pytest.approx(5.0)
-    assert (found.scans, found.gaps, found.camera) == (40, (), None)
+    assert (found.scans, found.camera) == (40, None)
     assert found.duration_s == pytest.approx(7.8)
 
 
@@ -44,16 +44,6 @@ def test_a_bag_that_cannot_be_mapped_is_shown_with_the_reason(tmp_path):
     assert inspect(path, BagOptions(laser_poses=((0.0, 0.0, 0.0),))).problem is None
     lonely = inspect(save(tmp_path / "lonely.bag", [mounted(), odom(100.0, (0.0, 0.0, 0.0))]))
     assert "no laser scans" in lonely.problem
-
-
-def test_gaps_and_steps_back_are_counted(tmp_path):
-    early = [message for message in drive(60) if not 104.0 < message.bag_time < 107.0 or message.topic != "/scan"]
-    late = scan(111.9, bag_time=112.0), scan(111.5, bag_time=112.1)
-    found = inspect(save(tmp_path / "run.bag", [*early, *late, odom(112.2, (0.0, 0.0, 0.0))]))
-    (gap,) = found.gaps
-    assert gap.length_s == pytest.approx(3.2, abs=0.3)
-    assert gap.after_s == pytest.approx(3.8, abs=0.3)
-    assert "steps back in time kept: 1" in found.faults
 
 
 def test_a_log_has_no_topics_and_a_bag_shows_its_camera(tmp_path):

@@ -89,7 +89,7 @@ def test_angles_that_contradict_the_ranges(tmp_path, wrong, reason):
     few = [scan(100.05 + 0.2 * k, bag_time=100.08 + 0.2 * k, **{**edge, **wrong}) for k in range(5)]
     source = open_source(save_bag(tmp_path / "few.bag", [*drive(40), *few]))
     assert len(scans_of(source)) == 40
-    assert source.faults[Fault.BAD_BEAMS] == FaultCount(5, 2)
+    assert source.faults[Fault.BROKEN_MESSAGE] == FaultCount(5, 2)
     every = [mounted(), *(odom(100 + k, pose_at(k)) for k in range(5)), *few]
     with pytest.raises(SourceError) as refusal:
         open_source(save_bag(tmp_path / "every.bag", every)).survey()

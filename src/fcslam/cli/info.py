@@ -121,10 +121,6 @@ def _lines(found: "Inspection") -> "Iterator[str]":
     if found.camera is not None:
         camera = found.camera
         yield f"camera: {found.images} images of {camera.width} x {camera.height} pixels"
-    if found.gaps:
-        longest = sorted(found.gaps, key=lambda gap: -gap.length_s)[:3]
-        shown = ", ".join(f"{gap.length_s:.1f} s after {gap.after_s:.1f} s" for gap in longest)
-        yield f"gaps without scans: {len(found.gaps)}; the longest: {shown}"
     if found.faults:
         yield f"faults: {found.faults}"
     yield from found.notes

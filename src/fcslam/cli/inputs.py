@@ -123,8 +123,6 @@ def print_faults(console: "Console", faults: "Mapping[str, Faults]") -> None:
     for name, found in faults.items():
         if found:
             print_line(console, f"{name}: {found}")
-        for warning in found.warnings:
-            print_line(console, f"warning: {name}: {warning}")
 
 
 def pose(option: str, text: str) -> tuple[float, float, float]:

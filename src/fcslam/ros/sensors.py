@@ -26,7 +26,6 @@ from fcslam.sources.bags.codec import (
 )
 from fcslam.sources.bags.fixes import fix_of
 from fcslam.sources.bags.messages import (
-    BeamsError,
     OdometryReading,
     ScanMessage,
     odometry_in,
@@ -115,15 +114,10 @@ class LiveSensors:
             return
         try:
             items = self._decoded(topic, payload, received_ns)
-        except BeamsError as error:
-            if not self.audit.faults()[Fault.BAD_BEAMS].count:
-                self._notify(f"scans of {topic} are left out: {error}; correct the driver")
-            self.audit.add(Fault.BAD_BEAMS, self._counts[topic])
-            return
-        except ValueError:
+        except ValueError as error:
             broken = Fault.BROKEN_IMAGE if topic == self._topics.camera else Fault.BROKEN_MESSAGE
             if not self.audit.faults()[broken].count:
-                self._notify(f"{topic}: {broken}")
+                self._notify(f"{topic}: {broken} ({error}); correct the driver")
             self.audit.add(broken, self._counts[topic])
             return
         for item in items:

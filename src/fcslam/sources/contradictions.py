@@ -54,7 +54,7 @@ class ScanWatch:
         if not self._repeated.admits(scan):
             self._audit.add(Fault.REPEATED_SCAN, number)
             return
-        if not has_return(scan.ranges_m, scan.laser.max_range_m):
+        if not count_returns(scan.ranges_m, scan.laser.max_range_m):
             self._audit.add(Fault.NO_RETURN, number)
         if np.isnan(scan.T_odom_base).any():
             return
@@ -63,12 +63,6 @@ class ScanWatch:
             self._at_rest[scan.laser.T_base_laser] = scan
         elif changed_share(rest.ranges_m, scan.ranges_m, scan.laser.max_range_m) > CHANGED:
             self._audit.add(Fault.FROZEN_ODOMETRY, number)
-
-
-def has_return(ranges_m: Ranges, max_range_m: float) -> bool:
-    """Whether a scan has a return; most have one in the middle, which is looked at first."""
-    middle = ranges_m[len(ranges_m) // 2] if len(ranges_m) else 0.0
-    return bool(0.0 < middle < max_range_m) or count_returns(ranges_m, max_range_m) > 0
 
 
 def count_returns(ranges_m: Ranges, max_range_m: float) -> int:

@@ -12,10 +12,9 @@ class Fault(StrEnum):
     BROKEN_MESSAGE = "broken messages skipped"
     BROKEN_IMAGE = "missing or damaged images skipped"
     OTHER_BEAMS = "scans with the beams of another laser skipped"
-    BAD_BEAMS = "scans whose ranges do not fit their angles skipped"
     NO_ODOMETRY = "scans without odometry within 1 s skipped"
     HELD_ODOMETRY = "scans beyond the odometry's ends given its nearest pose"
-    FROZEN_ODOMETRY = "scans that change while the odometry stands still kept"
+    FROZEN_ODOMETRY = "scans that change while the odometry stands still, from ten in a row on placed by matching alone"
     REPEATED_SCAN = "scans that repeat the scan before skipped"
     ODOMETRY_JUMP = "jumps of the odometry bridged by scan matching"
     ODOMETRY_GAP = "scans in gaps of the odometry of more than 1 s kept"
@@ -29,17 +28,11 @@ class Fault(StrEnum):
     FIX_EXCHANGED = "GNSS fixes with a latitude beyond 90 degrees, as if exchanged with the longitude, skipped"
     NO_FIX = "GNSS messages that state that there is no fix skipped"
     UNKNOWN_FIX = "GNSS fixes of unknown status used"
-    NO_RETURN = "scans without a return, which clear nothing"
+    NO_RETURN = "scans without a return, placed by odometry alone, which clear nothing"
 
 
 FEWEST = 10
 """Fewer scans, poses or faults of one kind show nothing."""
-_CONSEQUENCES = {
-    Fault.FROZEN_ODOMETRY: "the odometry stood still while the scans changed; from ten in a row on, scan matching "
-    "alone gives the motion",
-    Fault.NO_RETURN: "a laser saw nothing; odometry alone gives the motion there",
-}
-"""What many faults of a kind mean for the map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +63,6 @@ class Faults:
     def plus(self, kind: Fault, count: int) -> "Faults":
         """These faults and ``count`` more, found by the robot and not by the reader."""
         return Faults({**self.counts, kind: FaultCount(self[kind].count + count)}, self.unit) if count else self
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Sentences about faults that may make the map worse."""
-        return tuple(text for kind, text in _CONSEQUENCES.items() if self[kind].count >= FEWEST)
 
     def __str__(self) -> str:
         return ", ".join(self._describe(kind) for kind in Fault if kind in self.counts) or "no faults"

@@ -160,7 +160,7 @@ def format_of(path: Path) -> str:
         raise SourceError(f"{path}: is a folder, not a recording; give the file of a recording ({known})")
     if path.name == "metadata.yaml":
         raise SourceError(f"{path}: describes a bag; give its folder, {path.parent}")
-    raise SourceError(f"{path}: not a recording of a known format ; give a {known}")
+    raise SourceError(f"{path}: not a recording of a known format; give a {known}")
 
 
 def _refuse_others(path: Path, content: bytes) -> None:

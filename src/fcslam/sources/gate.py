@@ -113,12 +113,6 @@ def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_coun
         raise SourceError(
             f"{path}: most {faults.unit}s are damaged{first_errors}, {faults}; copy or export the recording again"
         )
-    contradictory = faults[Fault.BAD_BEAMS]
-    if contradictory.count > scan_count:
-        raise SourceError(
-            f"{path}: {faults.unit} {contradictory.first_line}: the ranges of {contradictory.count} scans do not fit "
-            "angle_min, angle_max and angle_increment; correct the laser's driver and record again"
-        )
     if other.count > scan_count:
         raise SourceError(
             f"{path}: {faults.unit} {other.first_line}: {other.count} scans are not of the laser of the first ones "

@@ -11,13 +11,9 @@ from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odom
 from fcslam.sources.bags.census import DecodedBag
 from fcslam.sources.bags.codec import SCANS
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.bags.pairing import MAX_GAP_S
 from fcslam.sources.bags.transforms import Link
 from fcslam.sources.formats import bag_of, format_of, open_source, robot_in
 from fcslam.sources.source import Source
-
-GAP_INTERVALS = 5.0
-"""A time without a scan that is longer than ``MAX_GAP_S`` and so many usual intervals between scans is a gap."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +48,6 @@ class LaserContents:
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
-    """A time without a scan."""
-
-    after_s: float
-    """Time from the first scan to the last one before it, seconds."""
-    length_s: float
-
-
-@dataclass(frozen=True, slots=True)
 class Inspection:
     """The contents of a recording."""
 
@@ -81,7 +68,6 @@ class Inspection:
     """Topic of a bag, or frames in tf; None: no odometry, or no bag."""
     camera: CameraModel | None = None
     images: int = 0
-    gaps: tuple[Gap, ...] = ()
     faults: str = ""
     """Faults that are tolerated, one line; empty without faults."""
     notes: tuple[str, ...] = ()
@@ -146,7 +132,6 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
         origin.name if origin else None,
         survey.camera,
         images,
-        _gaps(stamps),
         str(source.faults) if source.faults else "",
         survey.notes,
     )
@@ -168,10 +153,3 @@ def _rate_hz(stamps: list[float]) -> float | None:
     steps_s = np.diff(np.sort(stamps))
     usual_s = float(np.median(steps_s)) if len(steps_s) else 0.0
     return 1.0 / usual_s if usual_s > 0.0 else None
-
-
-def _gaps(stamps: list[float]) -> tuple[Gap, ...]:
-    ordered = np.sort(stamps)
-    steps_s = np.diff(ordered)
-    limit_s = max(MAX_GAP_S, GAP_INTERVALS * float(np.median(steps_s))) if len(steps_s) else np.inf
-    return tuple(Gap(float(ordered[k] - ordered[0]), float(steps_s[k])) for k in np.flatnonzero(steps_s > limit_s))

@@ -3,12 +3,9 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import hypot, inf, remainder, tau
-from pathlib import Path
 from typing import Final
 
-from fcslam.errors import SourceError
 from fcslam.sources.faults import FEWEST
-from fcslam.sources.motion import LARGEST_SPEED
 from fcslam.sources.pose import Pose, relative_pose
 
 RESOLUTION_M: Final = 1e-3
@@ -18,8 +15,6 @@ LEAST_TRAVEL_M: Final = 1.0
 """A robot that drove less far may not have turned at all."""
 SIDEWAYS: Final = 0.1
 """Odometry without turns that moves sideways by a larger share of its travel has no heading."""
-LEAST_DURATION_S: Final = 10.0
-"""The stamps of a shorter drive may all be wrong."""
 
 
 @dataclass(slots=True)
@@ -32,11 +27,6 @@ class PathSummary:
     moves: bool = False
     earliest: float = inf
     latest: float = -inf
-    _steps: int = 0
-    """Steps of known duration to another position."""
-    _fast: int = 0
-    """Those faster than any robot."""
-    _stamp: float = 0.0
     _first: Pose | None = None
     _pose: Pose | None = None
     _sideways_m: float = 0.0
@@ -49,16 +39,12 @@ class PathSummary:
             self._first = pose
         elif pose != self._pose:
             self.moves = True
-            step_m = hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
-            self.length_m += step_m
-            if stamp > self._stamp:
-                self._steps += 1
-                self._fast += step_m > LARGEST_SPEED * (stamp - self._stamp)
+            self.length_m += hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
             if not self.says_something:
                 self._sideways_m += abs(relative_pose(self._pose, pose)[1])
                 self._leaves |= hypot(pose[0] - self._first[0], pose[1] - self._first[1]) > RESOLUTION_M
                 self._turns |= abs(remainder(pose[2] - self._first[2], tau)) > RESOLUTION_RAD
-        self._pose, self._stamp = pose, stamp
+        self._pose = pose
         self.count += 1
         self.earliest = min(self.earliest, stamp)
         self.latest = max(self.latest, stamp)
@@ -74,12 +60,6 @@ class PathSummary:
         return self._leaves and self._turns
 
     @property
-    def is_too_fast(self) -> bool:
-        """Whether the whole drive and most of its steps are faster than any robot; a jump alone does not count."""
-        is_fast = self.duration_s >= LEAST_DURATION_S and self.length_m > LARGEST_SPEED * self.duration_s
-        return is_fast and 2 * self._fast > self._steps
-
-    @property
     def fault(self) -> str | None:
         """Why these poses are not odometry, as the end of a sentence; None if they can be."""
         if self.count < FEWEST or self.says_something:
@@ -89,16 +69,6 @@ class PathSummary:
         if self._leaves and self.length_m > LEAST_TRAVEL_M and self._sideways_m > SIDEWAYS * self.length_m:
             return f"moves sideways for {self._sideways_m:.1f} of {self.length_m:.1f} m: its heading is never set"
         return None
-
-
-def check_units(path: Path, driven: PathSummary) -> None:
-    """Reject odometry in millimetres or centimetres."""
-    if driven.is_too_fast:
-        raise SourceError(
-            f"{path}: the odometry drives {driven.length_m:.0f} m in {driven.duration_s:.0f} s, as if in millimetres "
-            "or centimetres, or of two robots; correct it to metres, or map a bag without it by --sensors "
-            "odom-topic=none"
-        )
 
 
 def fault_of_odometry(poses: Iterable[Pose]) -> str | None:

@@ -141,15 +141,10 @@ class RangeSample:
         middle = float(np.median(large)) if len(large) else 0.0
         different = np.unique(np.concatenate((returns, beyond)))
         is_whole = len(different) >= _FEWEST_VALUES and bool(np.mean(different == np.rint(different)) > _WHOLE)
-        if large is beyond and middle < LONGEST_USUAL_M:
-            return (
-                f"half of the ranges{which} are above {middle:g} m, beyond the range_max of {farthest:g} m; correct it "
-                "in the driver and record again"
-            )
-        if middle > LONGEST_USUAL_M and (large is beyond or _is_varied(returns)):
+        if large is beyond or (middle > LONGEST_USUAL_M and _is_varied(returns)):
             return (
                 f"half of the ranges{which} are above {middle:g}, too much for metres {limits}; they seem to be in "
-                f"another unit{', or intensities' * is_whole}: correct them and give the recording again"
+                f"another unit{', or intensities' * is_whole}, or range_max is too low: correct them and record again"
             )
         if is_whole:
             return (

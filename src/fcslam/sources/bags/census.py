@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
 from typing import Any, Final, NamedTuple
@@ -39,7 +39,6 @@ from fcslam.sources.bags.codec import (
 from fcslam.sources.bags.container import BagPart, Topic, check_order, open_parts
 from fcslam.sources.bags.messages import (
     LONGEST_NAME,
-    BeamsError,
     OdometryReading,
     ScanMessage,
     StampedTransform,
@@ -78,7 +77,7 @@ class TopicCensus:
     """Transforms of tf from a parent to a child: the first, and the first ones that differ from it in each way."""
     odom_frames: set[str] = field(default_factory=set)
     """Parent frames of odometry."""
-    lags_ns: "array[int]" = field(default_factory=partial(array, "q"))
+    lags_s: "array[float]" = field(default_factory=lambda: array("d"))
     """Times from the stamps of messages to their recording."""
     unstamped: int = 0
     """Messages with a stamp of zero."""
@@ -96,11 +95,11 @@ class TopicCensus:
     @cached_property
     def lag_ns(self) -> int:
         """What the times of recording of messages without a stamp are less: the clock of the others counts."""
-        return int(np.median(self.lags_ns)) if self.unstamped and self.lags_ns else 0
+        return round(NANOSECONDS * float(np.median(self.lags_s))) if self.unstamped and self.lags_s else 0
 
     def _note_stamp(self, header: Any, now_ns: int) -> None:
         if stamp_ns := stamp_ns_of(header):
-            self.lags_ns.append(now_ns - stamp_ns)
+            self.lags_s.append((now_ns - stamp_ns) / NANOSECONDS)
         else:
             self.unstamped += 1
 
@@ -293,17 +292,13 @@ def _decode(payload: bytes, kind: str, ros1: bool) -> Any:
     return MessageCodec(ros1).decode(payload, kind)
 
 
-def _restamped(content: Content, time_ns: int, lag_ns: int) -> Content:
+def _restamped(content: Any, time_ns: int, lag_ns: int) -> Any:
     """The content of a topic by one clock: a stamp that is the time of recording was zero."""
-    if isinstance(content, ValueError):
-        return content
     if isinstance(content, list):
-        return [each._replace(stamp=_by_one_clock(each.stamp, time_ns, lag_ns)) for each in content]
-    return content._replace(stamp=_by_one_clock(content.stamp, time_ns, lag_ns))
-
-
-def _by_one_clock(stamp: float, time_ns: int, lag_ns: int) -> float:
-    return (time_ns - lag_ns) / NANOSECONDS if stamp == time_ns / NANOSECONDS else stamp
+        return [_restamped(each, time_ns, lag_ns) for each in content]
+    if isinstance(content, ValueError) or content.stamp != time_ns / NANOSECONDS:
+        return content
+    return content._replace(stamp=(time_ns - lag_ns) / NANOSECONDS)
 
 
 def _packed(content: Content) -> bytes:
@@ -311,7 +306,7 @@ def _packed(content: Content) -> bytes:
         fields = json.dumps(("scan", *content._replace(raw_ranges_m=None)))  # type: ignore[arg-type]
         return fields.encode() + b"\n" + content.raw_ranges_m.tobytes()
     if isinstance(content, ValueError):
-        return json.dumps((type(content).__name__, str(content))).encode()
+        return json.dumps(("invalid", str(content))).encode()
     kind = "odometry" if isinstance(content, OdometryReading) else "transforms"
     return json.dumps((kind, *content)).encode()
 
@@ -333,4 +328,4 @@ def _unpacked(packed: bytes) -> Content:
             StampedTransform(stamp, parent, child, Transform(tuple(at), tuple(turn)))
             for stamp, parent, child, (at, turn) in fields
         ]
-    return (BeamsError if kind == BeamsError.__name__ else ValueError)(*fields)
+    return ValueError(*fields)

@@ -9,7 +9,7 @@ from fcslam.sources.bags.camera import MAX_SIDE_PX, Calibration
 from fcslam.sources.bags.codec import IMAGE, POINT_CLOUD
 from fcslam.sources.bags.messages import LONGEST_SWEEP_S, header_of
 from fcslam.sources.bags.options import GivenPose
-from fcslam.sources.bags.transforms import in_space, planar, rotated
+from fcslam.sources.bags.transforms import in_space, planar
 from fcslam.sources.point_clouds import CloudMounting, PointCloud, depth_points
 
 MOST_POINTS: Final = 4_000_000
@@ -36,15 +36,14 @@ _UP: Final = 0.7
 
 def cloud_mounting(T_base_sensor: Transform, kind: str, frame: str) -> CloudMounting:
     """The mounting that tf has, of a sensor with messages of type ``kind`` in ``frame``."""
-    columns = [rotated(T_base_sensor.rotation, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
     axes = _OPTICAL if lacks_optical_frame(T_base_sensor, kind, frame) else np.eye(3)
     heading_rad = planar(T_base_sensor)[2]
-    return CloudMounting(np.array(columns).T @ axes, np.array(T_base_sensor.translation_m), heading_rad)
+    return CloudMounting(T_base_sensor.rotation_matrix() @ axes, np.array(T_base_sensor.translation_m), heading_rad)
 
 
 def lacks_optical_frame(T_base_sensor: Transform, kind: str, frame: str) -> bool:
     """Whether depth images are in a frame of the camera's body: its z axis, along which they look, points up."""
-    return kind == IMAGE and "optical" not in frame and rotated(T_base_sensor.rotation, (0.0, 0.0, 1.0))[2] > _UP
+    return kind == IMAGE and "optical" not in frame and bool(T_base_sensor.rotation_matrix()[2, 2] > _UP)
 
 
 def given_cloud_mounting(pose: GivenPose, kind: str, frame: str) -> CloudMounting:

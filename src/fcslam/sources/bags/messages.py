@@ -22,10 +22,6 @@ LONGEST_NAME = 255
 """Characters in the name of a topic or a frame, as in ROS 2."""
 
 
-class BeamsError(ValueError):
-    """The ranges and the angles of a scan contradict each other; the message says how."""
-
-
 class ScanMessage(NamedTuple):
     """sensor_msgs/LaserScan, or the first echoes of sensor_msgs/MultiEchoLaserScan."""
 
@@ -116,20 +112,20 @@ def _check_angles(count: int, first_rad: float, increment_rad: float, last_rad: 
     """Refuse angles that leave open where the beams look. One range more or less is usual, as drivers count in
     different ways whether a full turn includes the first direction again."""
     if not all(map(isfinite, (first_rad, increment_rad, last_rad))):
-        raise BeamsError("an angle is not finite")
+        raise ValueError("an angle is not finite")
     if increment_rad == 0.0:
-        raise BeamsError("angle_increment is 0")
+        raise ValueError("angle_increment is 0")
     if abs(first_rad) > 1.01 * FULL_TURN_RAD or not is_field_of_view(Beams(count, 0.0, increment_rad)):
         is_degrees = is_field_of_view(Beams(count, radians(first_rad), radians(increment_rad)))
         remedy = ", as if in degrees: publish radians" * is_degrees
-        raise BeamsError(
+        raise ValueError(
             f"{count} ranges from angle_min {first_rad:g} by {increment_rad:g} rad have no field of view{remedy}"
         )
     stated = (last_rad - first_rad) / increment_rad + 1.0
     if stated < 1.0:
-        raise BeamsError("angle_increment leads away from angle_max")
+        raise ValueError("angle_increment leads away from angle_max")
     if abs(stated - count) > max(SAME_VIEW_BEAMS, ROUNDING * count):
-        raise BeamsError(f"{count} ranges, but the angles are those of {stated:.0f}")
+        raise ValueError(f"{count} ranges, but the angles are those of {stated:.0f}")
 
 
 def measured_ranges(scan: ScanMessage) -> Ranges:

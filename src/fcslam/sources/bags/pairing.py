@@ -4,9 +4,6 @@ Poses are interpolated between two readings; a scan with exactly the stamp of a 
 Odometry may come later than the scan, so scans wait for it in the order of the recording. The two readings are those
 nearest in the recording, not in time, so that a step back of the clock does not mix earlier and later readings.
 
-An image whose clock is ahead would hold the scans behind it. So once such a scan has its pose, the image waits no
-longer and gets the nearest pose.
-
 A reading that was recorded a little late, after one with a later stamp, counts at its time.
 
 Before the first and after the last reading, and where the odometry's clock steps back, a scan gets the pose of the
@@ -28,8 +25,6 @@ from fcslam.sources.pose import Pose, interpolated_pose
 MAX_GAP_S = 1.0
 """Largest time between a scan and a reading outside of which it has no odometry."""
 
-_AHEAD_S = 0.2
-"""An image that is farther ahead of the newest reading than this holds no scan; by one clock, odometry is not later."""
 _LATE_S, _MOST_LATE = 0.15, 3
 """A reading may be recorded so long after one with a later stamp, and so many in a row, as over a network."""
 _LONGEST_QUEUE = 1000
@@ -101,7 +96,7 @@ class OdometryPairing:
             queue.append(_QueuedItem(number, item, (item.T_odom_base, None)))
         else:
             queue.append(_QueuedItem(number, item, _look_back(readings, item.stamp)))
-        while queue and (self._is_complete(queue[0]) or len(queue) > _LONGEST_QUEUE or self._is_held_by_image()):
+        while queue and (self._is_complete(queue[0]) or len(queue) > _LONGEST_QUEUE):
             yield _with_pose(queue.popleft(), readings)
 
     def _is_late(self, stamp: float) -> bool:
@@ -119,14 +114,6 @@ class OdometryPairing:
         end_s = waiting.item.end
         is_covered = self._readings[-1].stamp >= end_s or self._readings[-1].stamp < waiting.item.stamp
         return is_covered or any(isinstance(each.item, ScanMessage) and each.item.end > end_s for each in self._queue)
-
-    def _is_held_by_image(self) -> bool:
-        """Whether the first item is an image of a clock that is ahead, and a scan behind it has its pose."""
-        first = self._queue[0].item
-        if not isinstance(first, ImageMessage) or not self._readings:
-            return False
-        is_ahead = first.stamp - self._readings[-1].stamp > _AHEAD_S
-        return is_ahead and any(each.match and isinstance(each.item, ScanMessage) for each in self._queue)
 
     def flush(self) -> Iterator[tuple[int, Entry]]:
         """Yield all that wait, as no odometry comes any more."""

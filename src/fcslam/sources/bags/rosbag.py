@@ -18,7 +18,7 @@ from fcslam.records import GnssFix, Odometry, SensorRecord, frozen
 from fcslam.sources.bags.census import DecodedBag
 from fcslam.sources.bags.container import is_transforms
 from fcslam.sources.bags.fixes import FIX_INTERVAL_S, NO_FIX, fix_of, fix_topics
-from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, BeamsError, OdometryReading
+from fcslam.sources.bags.messages import OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
 from fcslam.sources.bags.plan import BagPlan, plan_of
@@ -29,7 +29,7 @@ from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformErr
 from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
-from fcslam.sources.path_summary import PathSummary, check_units
+from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample, CloudBand
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -163,9 +163,6 @@ class RosBag:
         for message in self.bag.read(plan.read_topics(with_images)):
             try:
                 items = plan.items(message, band, self.options.correction)
-            except BeamsError:
-                audit.add(Fault.BAD_BEAMS, message.number)
-                continue
             except ValueError as error:
                 errors.setdefault(message.topic.name, f"message {message.number} of it: {error}")
                 is_image = message.topic == plan.topics.camera
@@ -231,11 +228,6 @@ class RosBag:
                 for topic, its in self.bag.census.items()
                 if topic in plan.read_topics(with_images=False) and not is_transforms(topic) and its.unstamped > 1
             ),
-            *(
-                f"{self.path}: {laser.name} states no range_max, ranges up to {UNKNOWN_RANGE_M:g} m count"
-                for laser, its_m in zip(lasers, farthest_m, strict=True)
-                if its_m == UNKNOWN_RANGE_M
-            ),
             *chain.from_iterable(laser.notes(self.path, self.options.cloud_band) for laser in lasers),
             *plan.scans.notes,
             *body_notes,
@@ -269,7 +261,6 @@ class RosBag:
                 f"{odometry.latest:.3f} s; record both by one clock, all the way, or map without odometry by --sensors "
                 "odom-topic=none"
             )
-        check_units(path, scans)
 
     def _mountings(self, base_frame: str, errors: Mapping[str, str]) -> list[Mounting]:
         lasers, poses = self.plan.lasers, self.options.laser_poses

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fcslam.errors import FcslamError
+from fcslam.geometry import se3
 from fcslam.records import FloatArray, Transform
 from fcslam.sources.pose import Pose
 
@@ -41,11 +42,10 @@ Link = tuple[str, str]
 """Names of the parent and the child of a transform."""
 USUAL_BASES = ("base_footprint", "base_link")
 """Frames of the robot's body, where no message names it."""
-_CORRECTED = ("map", "world", "earth", "utm")
+_CORRECTED = ("map", "world", "earth", "utm", "camera_init")
+"""Frames in which a robot drives besides that of its odometry, and where it jumps; the last is of LOAM's successors."""
 _NO_ODOMETRY = ("map", *USUAL_BASES)
 """Frames in which a robot jumps, or in which its joints move."""
-_FIXED = ("map", "world", "camera_init")
-"""Frames in which a robot drives, besides that of its odometry; the last is of LOAM and its successors."""
 IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
@@ -77,7 +77,7 @@ def in_space(pose: FloatArray) -> Transform:
 
 def mounting(T_base_laser: Transform) -> Mounting:
     """Mounting of a laser with this pose: planar pose, orientation and tilt."""
-    up = min(1.0, max(-1.0, rotated(T_base_laser.rotation, (0.0, 0.0, 1.0))[2]))
+    up = min(1.0, max(-1.0, float(T_base_laser.rotation_matrix()[2, 2])))
     lean_rad = acos(up)
     return Mounting(planar(T_base_laser), up < 0.0, min(lean_rad, pi - lean_rad))
 
@@ -113,11 +113,13 @@ class TransformTree:
             pairs = (pair for at in pairwise(moving) for pair in (at, at[::-1]))
             parent, child = next(pair for pair in pairs if self.links.get(pair, IDENTITY) is None)
             raise NoTransformError(f"no fixed transform from '{base}' to '{frame}' ('{child}' moves in '{parent}')")
-        result = IDENTITY
-        for at, to in reversed(list(pairwise(way))):
-            step = self.links.get((at, to))
-            result = _compose(_inverse(self.links[to, at] or IDENTITY) if step is None else step, result)
-        return result
+        pose = se3.IDENTITY
+        for at, to in pairwise(way):
+            step = self.links.get((at, to)) or self.links.get((to, at)) or IDENTITY
+            T_at_to = (*step.translation_m, *step.rotation)
+            pose = se3.compose(pose, T_at_to if (at, to) in self.links else se3.inverse(T_at_to))
+        x, y, z, *rotation = pose.tolist()
+        return Transform((x, y, z), tuple(rotation))
 
     def _way(self, base: str, frame: str, is_fixed_only: bool) -> list[str] | None:
         """The frames on the shortest way, with both ends."""
@@ -196,48 +198,11 @@ def is_corrected(frame: str) -> bool:
 
 def is_fixed(frame: str) -> bool:
     """Whether a frame of this name usually stands on the floor."""
-    return is_odom(frame) or last_part(frame) in _FIXED
+    return is_odom(frame) or is_corrected(frame)
 
 
 def _matches(link: Link, parent: str | None, child: str | None) -> bool:
     return parent in (None, link[0]) and child in (None, link[1])
-
-
-def rotated(rotation: Quaternion, vector: Vector) -> Vector:
-    """The vector turned by the rotation."""
-    x, y, z, w = rotation
-    twice = tuple(2.0 * value for value in _cross((x, y, z), vector))
-    turned = _cross((x, y, z), (twice[0], twice[1], twice[2]))
-    a, b, c = (v + w * t + u for v, t, u in zip(vector, twice, turned, strict=True))
-    return a, b, c
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _compose(T_a_b: Transform, T_b_c: Transform) -> Transform:
-    turned = rotated(T_a_b.rotation, T_b_c.translation_m)
-    x, y, z = (a + b for a, b in zip(T_a_b.translation_m, turned, strict=True))
-    return Transform((x, y, z), _product(T_a_b.rotation, T_b_c.rotation))
-
-
-def _inverse(transform: Transform) -> Transform:
-    x, y, z, w = transform.rotation
-    back: Quaternion = (-x, -y, -z, w)
-    a, b, c = rotated(back, transform.translation_m)
-    return Transform((-a, -b, -c), back)
-
-
-def _product(p: Quaternion, q: Quaternion) -> Quaternion:
-    px, py, pz, pw = p
-    qx, qy, qz, qw = q
-    return (
-        pw * qx + px * qw + py * qz - pz * qy,
-        pw * qy - px * qz + py * qw + pz * qx,
-        pw * qz + px * qy - py * qx + pz * qw,
-        pw * qw - px * qx - py * qy - pz * qz,
-    )
 
 
 def difference(first: Transform, second: Transform) -> int:
@@ -251,7 +216,7 @@ def difference(first: Transform, second: Transform) -> int:
         return 0
     (x, y, heading_rad), (other_x, other_y, other_rad) = planar(first), planar(second)
     is_same = max(abs(x - other_x), abs(y - other_y)) <= _STILL and cos(heading_rad - other_rad) > cos(2.0 * _STILL)
-    is_upright = all(rotated(each.rotation, (0.0, 0.0, 1.0))[2] > cos(_LARGEST_SWAY_RAD) for each in (first, second))
+    is_upright = all(each.rotation_matrix()[2, 2] > cos(_LARGEST_SWAY_RAD) for each in (first, second))
     return 1 if is_same and is_upright else 2
 
 

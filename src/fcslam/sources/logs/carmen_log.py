@@ -21,7 +21,7 @@ from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import FIRST_MESSAGES, ScanGate, check_consistency, scan_window
 from fcslam.sources.logs.carmen import BROKEN, SICK_MAX_RANGE_M, CarmenArrays
 from fcslam.sources.logs.laser import laser_model, usual_log_beams
-from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary, check_units
+from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary
 from fcslam.sources.pose import UNKNOWN_POSE, pose_of
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -113,7 +113,6 @@ class CarmenLog:
             driven = PathSummary()
             for stamp, pose in zip(log.odometry_stamps, log.odometry, strict=True):
                 driven.add(stamp, pose_of(pose))
-        check_units(path, driven)
         # a line that states the angles says more
         telling = next((k for k in admitted if log.stated[k] is not None), admitted[0])
         laser = laser_model(log, telling, admitted)
