@@ -78,6 +78,21 @@ def test_a_robot_with_a_laser_stays_in_the_plane(tmp_path):
     assert {type(each) for each in opened(tmp_path, messages).records()} == {LaserScan, Odometry}
 
 
+def test_without_wheels_scans_carry_the_turns_of_the_gyro(tmp_path):
+    ranges = np.linspace(2.0, 3.0, 90)
+    messages = [each for each in drive() if each.topic not in ("/points", "/odom")]
+    messages.append(tf(START, "base_link", "laser", topic="/tf_static"))
+    messages += [
+        scan(START + t, ranges + t, angle_increment=np.pi / 90, time_increment=1e-3) for t in np.arange(0.1, 1.4, 0.1)
+    ]
+    scans = list(opened(tmp_path, messages, None).records())
+    assert len(scans) == 13
+    readings = np.concatenate([each.gyro for each in scans])
+    assert (np.diff(readings[:, 0]) > 0.0).all()
+    assert readings[:, 1] == pytest.approx(0.8)
+    assert all(each.gyro[-1, 0] > each.stamp + each.sweep.last_s - 0.03 for each in scans)
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [

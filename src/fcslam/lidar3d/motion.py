@@ -4,20 +4,16 @@ Wheels give the path in the plane of the floor, the gyro of an IMU all rotations
 it did. Registration then says how far this was wrong: scales of the wheels and the bias of the gyro are learned.
 """
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from fcslam.compiled import njit
 from fcslam.geometry import se2, se3
+from fcslam.lidar.gyro import FEWEST_READINGS, GYRO_NOISE, KEPT_S, GyroBias, covers, integral, newest
 from fcslam.lidar.odometry import WHEELS, OdometryTrust, odometry_error
 from fcslam.records import CloudScan, FloatArray
 
-_KEPT_S: Final = 2.0
-"""Readings that are older than the begin of a turn by more are forgotten."""
-_HELD_S: Final = 0.1
-"""The newest reading counts as long as this."""
 _ACCELERATION: Final = np.array([1.0, 1.0, 1.0, 3.0, 3.0, 5.0])
 """Standard deviation of the acceleration of a robot without other sensors, m/s^2 and rad/s^2: x, y, z, then about
 each."""
@@ -28,11 +24,8 @@ _LIFT_SHARE, _TILT_RAD = 0.02, 0.03
 _GYRO_RAD, _GYRO_SHARE = 1e-3, 0.01
 """Standard deviation of a rotation by gyro: of a turn of the LiDAR, and per radian."""
 _LEAST_M: Final = 2e-3
-_BIAS_SIGMA, _BIAS_DRIFT, _GYRO_NOISE = 0.02, 1e-4, 0.005
-"""Standard deviations of the bias of a gyro before it is learned, of its change in a turn, and of a reading, rad/s."""
 _AT_REST: Final = 1e-3
 """Metres and radians in a turn below which a robot stands still."""
-_FEWEST_READINGS: Final = 5
 
 
 class Prediction(NamedTuple):
@@ -48,20 +41,6 @@ class Prediction(NamedTuple):
     """The integral of the gyro, bias included, shape (3,), radians; None without a gyro."""
 
 
-@dataclass(frozen=True, slots=True)
-class GyroBias:
-    """Bias of a gyro as a Kalman filter knows it."""
-
-    value: FloatArray
-    variance: float = _BIAS_SIGMA**2
-
-    def learn(self, measured: FloatArray, sigma: float) -> "GyroBias":
-        """Learn from a measurement of the bias, shape (3,), rad/s."""
-        variance = self.variance + _BIAS_DRIFT**2
-        gain = variance / (variance + sigma**2)
-        return GyroBias(self.value + gain * (measured - self.value), (1.0 - gain) * variance)
-
-
 class MotionSensors:
     """The newest readings of the wheels and the IMU of a robot, and what was learned about them."""
 
@@ -75,13 +54,13 @@ class MotionSensors:
 
     def add(self, scan: CloudScan) -> None:
         """Take the readings that came with a turn."""
-        self._wheels = _newest(self._wheels, scan.wheels, scan.stamp - _KEPT_S)
-        self._imu = _newest(self._imu, scan.imu, scan.stamp - _KEPT_S)
+        self._wheels = newest(self._wheels, scan.wheels, scan.stamp - KEPT_S)
+        self._imu = newest(self._imu, scan.imu, scan.stamp - KEPT_S)
 
     @property
     def force(self) -> FloatArray | None:
         """Mean specific force over the newest readings of the IMU, shape (3,), m/s^2; None without an IMU."""
-        return self._imu[:, 4:].mean(axis=0) if len(self._imu) >= _FEWEST_READINGS else None
+        return self._imu[:, 4:].mean(axis=0) if len(self._imu) >= FEWEST_READINGS else None
 
     def predict(self, times: FloatArray) -> Prediction:
         """The motion over ascending ``times`` (K,), seconds."""
@@ -90,7 +69,7 @@ class MotionSensors:
         length_s = times[-1] - times[0]
         sigma = length_s * (_ACCELERATION * max(length_s, 0.05) if self._is_moving_known else _UNKNOWN)
         planar = rotation = None
-        if _covers(self._wheels, times):
+        if covers(self._wheels, times):
             path = self._path(times)
             planar = se2.motion(path[0], path[-1])
             steps = np.array([self.trust.distance.value] * 2 + [self.trust.turn.value]) * se2.relative(path)
@@ -102,10 +81,10 @@ class MotionSensors:
             sigma = np.array(
                 [error.position_m] * 2 + [least + _LIFT_SHARE * moved_m, *2 * [_TILT_RAD], error.heading_rad]
             )
-        if _covers(self._imu, times):
-            integral = _integral(self._imu[:, 0], self._imu[:, 1:4], times)
-            rotation = integral[-1]
-            turns = np.diff(integral, axis=0) - spans[:, None] * self.bias.value
+        if covers(self._imu, times):
+            turned = integral(self._imu[:, 0], self._imu[:, 1:4], times)
+            rotation = turned[-1]
+            turns = np.diff(turned, axis=0) - spans[:, None] * self.bias.value
             spread = np.sqrt(self.bias.variance) * length_s
             sigma[3:] = _GYRO_RAD + spread + _GYRO_SHARE * np.linalg.norm(rotation)
         return Prediction(_chain(moves, turns), np.maximum(sigma, 1e-5), planar, rotation)
@@ -128,38 +107,13 @@ class MotionSensors:
         if predicted.rotation is not None:
             rests = np.linalg.norm(predicted.planar or tangent) < _AT_REST
             turned = np.zeros(3) if rests else tangent[3:]
-            sigma = _GYRO_NOISE if rests else _GYRO_NOISE + sigma_rad / length_s
+            sigma = GYRO_NOISE if rests else GYRO_NOISE + sigma_rad / length_s
             self.bias = self.bias.learn((predicted.rotation - turned) / length_s, sigma)
 
     def _path(self, times: FloatArray) -> FloatArray:
         stamps = self._wheels[:, 0]
         headings = np.unwrap(self._wheels[:, 3])
         return np.column_stack([np.interp(times, stamps, each) for each in (*self._wheels[:, 1:3].T, headings)])
-
-
-def _newest(old: FloatArray, new: FloatArray, since: float) -> FloatArray:
-    """Readings since a time, in the order of their stamps; a clock that steps back begins anew."""
-    if len(old) and len(new) and new[-1, 0] < old[-1, 0] - _KEPT_S:
-        old = old[:0]
-    both = np.concatenate((old[max(0, np.searchsorted(old[:, 0], since) - 1) :], new))
-    return both[np.argsort(both[:, 0], kind="stable")]
-
-
-def _covers(readings: FloatArray, times: FloatArray) -> bool:
-    if len(readings) < _FEWEST_READINGS:
-        return False
-    return bool(readings[0, 0] <= times[0] + _HELD_S and readings[-1, 0] >= times[-1] - _HELD_S)
-
-
-def _integral(stamps: FloatArray, rates: FloatArray, times: FloatArray) -> FloatArray:
-    """Integral of ``rates`` (M, 3) from the first of ``times`` (K,) to each, shape (K, 3)."""
-    areas = np.diff(stamps)[:, None] * (rates[1:] + rates[:-1]) / 2.0
-    sums = np.vstack((np.zeros(3), np.cumsum(areas, axis=0)))
-    at = np.column_stack([np.interp(times, stamps, column) for column in sums.T])
-    beyond = times[:, None] - np.clip(times, stamps[0], stamps[-1])[:, None]
-    at += beyond * np.where(beyond < 0.0, rates[0], rates[-1])
-    since: FloatArray = at - at[0]
-    return since
 
 
 @njit

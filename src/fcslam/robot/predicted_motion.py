@@ -9,6 +9,7 @@ import numpy as np
 from fcslam.geometry import se2
 from fcslam.lidar.first_motion import LONGEST_GAP_S, first_sweep
 from fcslam.lidar.frontend import LidarFrontend
+from fcslam.lidar.gyro import Gyro
 from fcslam.lidar.lost import SEEN_S, is_in_reach, is_unplaced, relocated
 from fcslam.lidar.odometry import OdometryModel
 from fcslam.lidar.tracker import TrackedScan, TrackingResult
@@ -36,6 +37,7 @@ class MotionPrediction:
     """Stands in for the odometry of a robot, with constant velocity.
 
     It is the velocity in the sweep of the last scan, or that between the last two scans if they were measured at once.
+    If there is a gyro, it measures the turns.
     """
 
     def __init__(self) -> None:
@@ -51,6 +53,7 @@ class MotionPrediction:
         """The sweep of the last scan, as it was matched."""
         self.is_new = True
         """Whether the robot has not begun to move."""
+        self._gyro = Gyro()
 
     def begin(self, first: LaserScan, T_smooth_base: FloatArray) -> None:
         """Go on from a scan whose sweep has the robot's motion; its pose, shape (3,), as in ``observe``."""
@@ -60,6 +63,7 @@ class MotionPrediction:
     def predict(self, scan: LaserScan) -> LaserScan:
         """The next scan with its pose in a frame of the prediction's own, and with the motion during its sweep."""
         elapsed_s = 0.0 if self._last is None else scan.stamp - self._last[0]
+        self._gyro.add(scan)
         self._T_odom_last = self._T_odom_base
         if self._last is None or not elapsed_s <= LONGEST_GAP_S:
             return replace(scan, T_odom_base=frozen(self._T_odom_base))
@@ -76,6 +80,10 @@ class MotionPrediction:
                 sweep = sweep._replace(velocity=(x, y, theta))
         else:
             motion = np.zeros(3)
+        if scan.gyro is not None:
+            angles = self._gyro.angles(np.array([self._last[0], scan.stamp]))
+            motion = motion if angles is None else np.array([*motion[:2], angles[1]])
+            sweep = sweep and self._gyro.turning(sweep, scan.stamp)
         self._T_odom_base = se2.compose(self._T_odom_base, motion)
         return replace(scan, T_odom_base=frozen(self._T_odom_base), sweep=sweep)
 
@@ -93,7 +101,8 @@ class MotionPrediction:
         if self._last is None or scan.sweep is None or not self._goes_on(elapsed_s):
             return scan
         x, y, theta = (se2.log(se2.between(self._last[1], T_smooth_base)) / elapsed_s).tolist()
-        return replace(scan, sweep=scan.sweep._replace(velocity=(x, y, theta)))
+        sweep = scan.sweep._replace(velocity=(x, y, theta))
+        return replace(scan, sweep=sweep if scan.gyro is None else self._gyro.turning(sweep, scan.stamp))
 
     def follow(self, scan: LaserScan, T_smooth_base: FloatArray, sweep: Sweep | None) -> LaserScan:
         """A scan that waits for a decision, with its motion as it was found; the next prediction goes on from there."""
@@ -119,6 +128,7 @@ class MotionPrediction:
             if elapsed_s > 0.0:  # otherwise it is the same scan, in the map of another session
                 self._motion = se2.log(se2.between(self._last[1], T_smooth_base))
                 self._elapsed_s = elapsed_s
+                self._gyro.learn(self._last[0], stamp, float(self._motion[2]))
         self._last = None if T_smooth_base is None else (stamp, T_smooth_base)
 
 

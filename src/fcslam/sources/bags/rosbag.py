@@ -12,12 +12,16 @@ from itertools import chain, repeat
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from fcslam.errors import InputError, SourceError
 from fcslam.geometry import se2
-from fcslam.records import GnssFix, Odometry, SensorRecord, frozen
+from fcslam.records import FloatArray, GnssFix, Odometry, SensorRecord, frozen
 from fcslam.sources.bags.census import DecodedBag
+from fcslam.sources.bags.cloud_scans import valid
 from fcslam.sources.bags.container import is_transforms
 from fcslam.sources.bags.fixes import FIX_INTERVAL_S, NO_FIX, fix_of, fix_topics
+from fcslam.sources.bags.imu import ImuAxes, imu_of, imu_topics
 from fcslam.sources.bags.messages import OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
@@ -37,6 +41,8 @@ from fcslam.sources.source import WHOLE, ScanRange, Survey
 _audit = partial(Audit, "message")
 _EACH_LASER = "give one for each laser, in the same order"
 
+_AFTER_S = 0.02
+"""Readings of a gyro so long after a scan show its end."""
 _OF_SCANS = "its range_min and range_max"
 _OF_CLOUDS = "that its points are in metres, its mounting in tf and the heights of --sensors cloud-band"
 
@@ -110,6 +116,7 @@ class RosBag:
         rig, placeholders = self._reading.rig, self._reading.placeholders
         correction = self.options.correction
         floors = [floor and floor.mirrored() if correction.upside_down else floor for floor in correction.floors]
+        gyro, before_s = self._gyro, -np.inf
         found, faults = self._fixes
         fixes = deque(found)
         for kind, fault in faults.counts.items():
@@ -118,6 +125,10 @@ class RosBag:
         for number, entry in scan_window(entries, scans, _is_scan, audit):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
+                if len(gyro):
+                    end_s = entry.scan.end + _AFTER_S
+                    read, rest = np.searchsorted(gyro[:, 0], (before_s, end_s))
+                    record, before_s = replace(record, gyro=frozen(gyro[read:rest])), end_s
                 while fixes and fixes[0].stamp <= record.stamp:
                     yield fixes.popleft()
                 if values := placeholders[entry.scan.laser]:
@@ -133,6 +144,17 @@ class RosBag:
                     yield rig.image(entry)
                 except ValueError:
                     audit.add(Fault.BROKEN_IMAGE, number)
+
+    @cached_property
+    def _gyro(self) -> FloatArray:
+        """Readings of the gyro about the vertical, shape (K, 2), of a robot without odometry."""
+        if self.plan.odometry is not None:
+            return np.zeros((0, 2))
+        axes = ImuAxes(self.plan.tree, self._reading.base_frame)
+        messages = self.bag.read(imu_topics(self.robot)[:1])
+        rows = [axes.row(each) for each in valid(messages, lambda each: imu_of(each.content, each.bag_time_ns))]
+        readings: FloatArray = np.array(rows).reshape(-1, 7)[:, [0, 3]]
+        return readings[np.argsort(readings[:, 0], kind="stable")]
 
     @cached_property
     def _fixes(self) -> tuple[tuple[GnssFix, ...], Faults]:
