@@ -1,6 +1,6 @@
 """Three instances over one PostgreSQL server whose machines fail: real processes on loopback.
 
-    python benchmarks/instances.py [--kills 30] [--restarts 5] [--cuts 1] [--only latency]
+    python benchmarks/instances.py [--kills 30] [--restarts 5] [--cuts 1] [--only latency|faults|room]
 
 Ten missions of five robots each send to three instances of `fcslam serve --store`. Five simulated buildings are used
 twice. Each robot sends its packets in small batches to an instance chosen at random, and to the next one when it gets
@@ -16,9 +16,13 @@ A packet is acknowledged when a request with it got status 200. "Lost" counts th
 
 "Latency": the same batches go to a service with SQLite files and to an instance with PostgreSQL, in turn, from twenty
 robots of one mission; blocks of ten seconds alternate. "Intake": one thread, without HTTP and workers.
+
+"Room": three instances have room for one mission each, and five missions want a worker. The instance with the open
+mission is killed again and again.
 """
 
 import json
+import os
 import random
 import secrets
 import signal
@@ -57,7 +61,7 @@ from fcslam.wire.packets import decode, encode
 sys.path.insert(0, str(common.REPOSITORY))
 from tests.postgres import HAS_POSTGRES, Server, free_port
 
-BUILDINGS, MISSIONS, ROBOTS = 5, 10, 5
+BUILDINGS, MISSIONS, ROBOTS, WANTED = 5, 10, 5, 5
 PATH_M, SEED = 20.0, 4200
 NAMES = ("one", "two", "three")
 CUT_S = 30.0
@@ -334,6 +338,35 @@ def faults(chosen: Any, place: Path, buildings: Sequence[Building], report: comm
     server.stop()
 
 
+def room(chosen: Any, place: Path, report: common.Report) -> None:
+    """Kill the instance that has the open mission where there are more missions than workers."""
+    os.environ["FCSLAM_MAX_MISSIONS"] = "1"
+    server = Server(place / "server")
+    url = take_password(server.url)
+    fleet = Fleet(place, server)
+    watch = Watch(url, fleet.ports)
+    for number in range(WANTED):
+        post(fleet.ports["one"], "/api/v1/missions", json.dumps({"name": f"m{number}"}).encode())
+    wanted = Postgres(url, "room")
+    times: list[float] = []
+    for _ in range(chosen.kills):
+        wanted.rows("UPDATE missions SET is_wanted = true RETURNING name")
+        mission = next(name for is_open, name in wanted.rows("SELECT is_open, name FROM missions") if is_open)
+        until = time.monotonic() + PATIENCE_S
+        while mission not in (held := watch.held()) or len(held) < len(NAMES):
+            if time.monotonic() > until:
+                sys.exit(f"{mission} has no worker, or an instance has no mission: {held}")
+            time.sleep(0.1)
+        victim, began = held[mission], time.monotonic()
+        fleet.processes[victim].kill()
+        times += watch.fail_over(victim, [mission], began)
+        print(f"{times[-1]:.1f} s", file=sys.stderr, flush=True)
+        fleet.processes[victim].start()
+    report.table("The open mission, with room for three of five", FAULTS, [fault_row("kill", chosen.kills, times)])
+    fleet.stop()
+    server.stop()
+
+
 def fault_row(kind: str, count: int, times: Sequence[float]) -> tuple[Any, ...]:
     """A row of ``FAULTS``."""
     return kind, count, len(times), *(quantiles(times, (0.5, 0.95, 1.0)) if times else (None, None, None))
@@ -449,7 +482,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=30)
     parser.add_argument("--restarts", type=int, default=5)
     parser.add_argument("--cuts", type=int, default=1)
-    parser.add_argument("--only", choices=("latency", "faults"), help="one part")
+    parser.add_argument("--only", choices=("latency", "faults", "room"), help="one part")
     parser.add_argument("--recordings", type=Path, help="folder that keeps the recordings and their maps")
     chosen = parser.parse_args()
     if not HAS_POSTGRES:
@@ -460,6 +493,14 @@ def main() -> None:
         place = Path(folder)
         place.chmod(0o755)  # the server's user must reach its folder
         recordings = chosen.recordings or place
+        if chosen.only in (None, "room"):
+            crowded = place / "room"
+            crowded.mkdir(mode=0o755)
+            room(chosen, crowded, report)
+            os.environ.pop("FCSLAM_MAX_MISSIONS")
+        if chosen.only == "room":
+            report.write()
+            return
         buildings = [building(number, recordings / f"building{number}") for number in range(BUILDINGS)]
         if chosen.only != "faults":
             latency(place, buildings, report)

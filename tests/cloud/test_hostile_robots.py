@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from byzantine import LIES, paths
 
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
@@ -11,7 +12,7 @@ from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
-from fcslam.records import ClosureStatus, Constraint, Keyscan, KeyscanId, Place, ReasonCode, frozen
+from fcslam.records import ClosureStatus, Constraint, Keyscan, KeyscanId, Place, ReasonCode, Removal, frozen
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet
 from tests.small_fleet import fingerprint, in_order, map_of
@@ -105,3 +106,24 @@ def test_a_restored_fleet_keeps_robots_apart(packets, attacked):
     stored = {PacketNumber(packet.robot, packet.sequence): packet for packet in packets}
     restored = Fleet.restored(FleetConfig(), 0, attacked.fleet.state(), stored.__getitem__)
     assert fingerprint(restored.conclude()) == fingerprint(attacked.fleet.conclude())
+
+
+@pytest.fixture(scope="module")
+def fleet():
+    """What each of three robots sends, and the result of the first two."""
+    robots = small_fleet.draw(3, 15.0, seed=5).robots
+    streams = [[decode(encode(packet)) for packet in small_fleet.sent_by(robot)] for robot in robots]
+    return streams, fed(in_order([*streams[0], *streams[1]])).finalize()
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_robot_that_lies_about_places_or_closures_moves_nobody_and_leaves_no_byte(lie, fleet):
+    (first, second, hostile), alone = fleet
+    cloud = fed(in_order([*first, *second, *LIES[lie](hostile, first)]))
+    found = cloud.finalize()
+    now, then = ({robot.robot: robot.T_map_base for robot in result.robots} for result in (found, alone))
+    assert {name: map_of(found)[name] for name in then} == map_of(alone)
+    xy, wanted = (np.concatenate([those[name][:, :2] for name in then]) for those in (now, then))
+    assert np.hypot(*(se2.transform(n_point_alignment(wanted, xy), xy) - wanted).T).max() < 0.02
+    cloud.fleet.edit([Removal(hostile[0].robot, 0)])
+    assert paths(cloud.finalize()) == paths(alone)

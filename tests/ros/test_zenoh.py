@@ -73,6 +73,16 @@ def test_messages_arrive_in_both_directions(network, peer):
     assert went[0] == HELLO
 
 
+def test_each_publisher_of_a_topic_has_an_id(network, peer, port):
+    came, other = set(), zenoh_peer.ZenohPeer(port, domain=3)
+    network.subscribe("/robot1/scan", SCAN, Quality(reliable=False), lambda _, publisher: came.add(publisher))
+    puts = [each.publisher("/robot1/scan", SCAN, zenoh_peer.BEST_EFFORT) for each in (peer, other)]
+    sent = encoded(SCAN, scan(1.0, np.ones(90)))
+    wait_for(lambda: [put(sent) for put in puts] and len(came) == 2)
+    other.close()
+    assert "" not in came
+
+
 def test_what_is_latched_reaches_who_comes_late(network, peer):
     came, went = [], []
     network.publisher("/robot1/text", STRING, Quality(True, latched=True, depth=1))(HELLO)

@@ -35,8 +35,8 @@ def _session(mode, listen, connect=""):
     return zenoh.open(config)
 
 
-def attached(number):
-    return struct.pack("<q", number) + struct.pack("<q", time.time_ns()) + b"\x10" + bytes(range(16))
+def attached(number, sender):
+    return struct.pack("<q", number) + struct.pack("<q", time.time_ns()) + b"\x10" + sender
 
 
 class ZenohPeer:
@@ -74,7 +74,8 @@ class ZenohPeer:
             publisher = self.session.declare_publisher(key)
         self.tokens.append(publisher)
         self._declare("MP", topic.replace("/", "%"), *key.split("/")[-2:], quality)
-        return lambda payload, number=1: publisher.put(payload, attachment=attached(number))
+        sender = str(self.session.zid()).encode().ljust(16)[:16]
+        return lambda payload, number=1: publisher.put(payload, attachment=attached(number, sender))
 
     def subscribe(self, topic, kind, quality, take):
         key = self._key(topic, kind)

@@ -207,6 +207,22 @@ def test_of_a_robot_whose_packets_wait_for_the_worker_no_more_are_taken(desk, ap
     assert desk.take(DATA[5]) == [Acknowledgement("a", 0, 5)]
 
 
+def test_packets_that_another_request_stored_and_the_worker_applied_meanwhile_disturb_nobody(desk):
+    desk.take(*DATA[:3])
+    desk.store.progress(9, [])  # six more came between this request's look at the store and the worker's count
+    assert desk.take(DATA[3]) == [Acknowledgement("a", 0, 3)]
+
+
+def test_a_wall_clock_that_steps_changes_neither_answers_nor_the_order(desk, tmp_path):
+    store, steps_s = MissionStore(tmp_path / "other.sqlite"), iter((1e9, 0.0, 2e9, -1e9))
+    stepping = Intake(store, lambda: 100.0, lambda: next(steps_s))
+    for first in range(0, 8, 2):
+        batch = write_batch(DATA[first : first + 2])
+        assert stepping.take("a", "x", batch, -1) == desk.intake.take("a", "x", batch, -1)
+    assert [one.data for _, one in store.arrivals(0, 100)] == [one.data for _, one in desk.store.arrivals(0, 100)]
+    store.close()
+
+
 def test_packets_that_wait_for_one_before_them_keep_out_neither_it_nor_other_robots(desk):
     small(desk, most_waiting=6)
     in_epoch = [encode(replace(p, epoch=1)) for p in PACKETS[1:9] if not isinstance(p.body, Hello)]

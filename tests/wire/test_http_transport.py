@@ -2,7 +2,7 @@
 
 import gzip
 import json
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 import pytest
 
@@ -183,6 +183,25 @@ def test_a_certificate_is_asked_for_and_must_be_signed_by_whom_is_trusted(tmp_pa
             plain.send(PACKETS, -1)
         plain.close()
     assert len(cloud.requests) == 1, "no token went to a stranger"
+
+
+@pytest.mark.parametrize(
+    ("host", "days", "said"),
+    [
+        ("127.1", 0, "is not valid for '127.1'.*ask the cloud by a name of its certificate"),
+        ("127.0.0.1", -400, "has expired.*renew it"),
+        ("127.0.0.1", 30, "is not yet valid.*correct the clock"),
+    ],
+)
+def test_a_certificate_of_another_name_or_date_gets_no_packet_and_no_token(host, days, said, tmp_path):
+    make_credentials(tmp_path, [], {}, datetime.now(UTC) + timedelta(days))
+    with serving(tls=tmp_path) as cloud:
+        url = cloud.url.replace("127.0.0.1", host)
+        wary = HttpTransport(url, "r", "ab" * 16, Credentials("secret", tmp_path / "ca.pem"))
+        with pytest.raises(CloudError, match=said):
+            wary.send(PACKETS, -1)
+        wary.close()
+    assert cloud.requests == []
 
 
 def test_a_cloud_without_tls_is_named(cloud):

@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
@@ -144,8 +144,6 @@ class Intake:
         self._log, self._arrivals = PacketLog(), 0
         self._released: deque[str] = deque()
         """Robots of the packets that may take effect and that the worker had not read when it noted its backlog."""
-        self._unread: Counter[str] = Counter()
-        """How many these are, by robot."""
         self._warned: set[str] = set()
         """Robots of whose refused packets there was a line."""
         self.follow()
@@ -216,7 +214,6 @@ class Intake:
                 for _ in self._log.ready(session):
                     pass
                 self._released.extend([envelope.robot] * (self._log.released - before))
-                self._unread[envelope.robot] += self._log.released - before
 
     def _limit_packets(self, robot: str, batch: Sequence[bytes]) -> None:
         unpacked = sum(map(unpacked_size, batch))  # unpacking takes time
@@ -248,9 +245,9 @@ class Intake:
         with self._lock:
             early = self._log.would_wait(PacketNumber(session_name(robot, epoch), k) for _, epoch, k in numbers)
             read = applied + sum(queued.values())
-            while self._log.released - len(self._released) < read:
-                self._unread[self._released.popleft()] -= 1
-            waiting = queued.get(robot, 0) + self._unread[robot]
+            while self._released and self._log.released - len(self._released) < read:  # others may have stored more
+                self._released.popleft()
+            waiting = queued.get(robot, 0) + self._released.count(robot)
         if waiting > self._most_waiting:
             raise BusyError(f"{robot}: {waiting} packets have not taken effect yet; send these again later")
         if early and self.waiting_count(robot) + len(early) > self._most_waiting:

@@ -174,9 +174,12 @@ class HttpClient:
             yield
         except httpx.RequestError as error:
             if isinstance(error.__cause__, ssl.SSLCertVerificationError) or "CERTIFICATE_VERIFY_FAILED" in str(error):
-                raise CloudError(
-                    f"{self._url}: its certificate is not trusted ({error}); give its ca.pem in --credentials"
-                ) from error
+                advice = "give its ca.pem in --credentials"
+                if "is not valid for" in str(error):
+                    advice = "ask the cloud by a name of its certificate, or add this one (fcslam tools certificates)"
+                elif "expired" in str(error) or "not yet valid" in str(error):
+                    advice = "renew it (fcslam tools certificates), or correct the clock here"
+                raise CloudError(f"{self._url}: its certificate is not trusted ({error}); {advice}") from error
             reason = str(error).removesuffix(".") or type(error).__name__
             raise UnavailableError(f"{self._url}: {reason}{self._hint(error)}") from error
 

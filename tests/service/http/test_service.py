@@ -477,3 +477,14 @@ def test_robots_with_a_camera_are_told_of_a_newer_detector_until_they_have_it(de
     assert not any(isinstance(body, DetectorUpdate) for body in desk.told(desk.send("b", B[:2]))), "it has no camera"
     assert get(desk, "detectors").json() == [{"channel": "camera", "version": version, "announced": True}]
     assert desk.ask("POST", f"{API}/detectors", "boss", content=b"no network").status_code == 400
+
+
+def test_an_administrator_goes_back_to_an_older_detector(desk):
+    old = BUNDLED_NETWORK.read_bytes()
+    announce = [desk.ask("POST", f"{API}/detectors", "boss", content=old).json()["version"]]
+    new = old.replace(announce[0].rpartition("-")[2].encode(), b"0123456789ab")
+    announce += [desk.ask("POST", f"{API}/detectors", "boss", content=each).json()["version"] for each in (new, old)]
+    assert announce[0] == announce[2] != announce[1]
+    hello = Hello("a", 0, (LASER,), {Channel.CAMERA: announce[1], Channel.LIDAR: "test-1"})
+    told = desk.told(desk.send("a", [encode(Packet("a", 0, 0, 0.0, hello))]))
+    assert [body.file.version for body in told if isinstance(body, DetectorUpdate)] == [announce[0]]

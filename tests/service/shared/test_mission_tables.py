@@ -12,9 +12,11 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import InputError, StoreError
 from fcslam.mission.mission_store import FACTS, TABLES, MissionStore, StoredPacket, check_mission
 from fcslam.records import Removal, Veto, frozen
-from fcslam.service.shared.files import fetch_folder, fetched, put_file
+from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.shared.files import SNAPSHOT, fetch_folder, fetch_snapshot, fetched, put_file
 from fcslam.service.shared.mission_tables import LeaseLostError, MissionTables, insert_mission
 from fcslam.storage.postgres import Postgres
+from tests.full_disk import largest_file
 from tests.mission.test_mission_store import correction, packet
 
 
@@ -157,6 +159,19 @@ def test_a_run_folder_travels_as_it_is(registry, postgres, tmp_path):
         assert (tmp_path / "seen" / "1" / path.relative_to(folder)).read_bytes() == path.read_bytes()
     (mission,) = registry.missions()
     assert mission.live == 1
+
+
+def test_a_worker_begins_without_the_snapshot_for_which_its_disk_has_no_room(registry, postgres, tmp_path):
+    MissionStore(MissionTables(postgres, registry.create("full"))).put([packet()], 0.0)
+    (lease,) = registry.claim(1)
+    folder = MissionFolder(tmp_path)
+    folder.snapshot.write_bytes(bytes(100_000))
+    put_file(postgres, lease, SNAPSHOT, folder.snapshot)
+    with largest_file(1000):
+        fetch_snapshot(postgres, lease, folder)
+    assert not folder.snapshot.exists(), "not half of it, and no older one"
+    fetch_snapshot(postgres, lease, folder)
+    assert folder.snapshot.read_bytes() == bytes(100_000)
 
 
 def test_two_instances_number_their_packets_together(registry, postgres):

@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 from fastapi import HTTPException, Request
@@ -120,20 +121,18 @@ class RequestLimits:
             return
 
         loop = asyncio.get_running_loop()
-        least = loop.time() + places / per_s
+        end = partial(loop.call_at, loop.time() + places / per_s, queue.end, place)
+        if who is None:
+            end()  # a stranger takes no place for longer
 
         async def sending(message: Message) -> None:
-            loop.call_at(least, queue.end, place)  # a long answer, as a stream of events, takes no place
+            end()  # a long answer, as a stream of events, takes no place
             await send(message)
 
-        if who is None:
-            loop.call_at(least, queue.end, place)
-            await self._app(scope, receive, send)
-            return
         try:
             await self._app(scope, receive, sending)
         finally:
-            loop.call_at(least, queue.end, place)
+            end()
 
 
 async def read_body(request: Request, longest: int) -> bytes:

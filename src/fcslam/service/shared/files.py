@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -45,12 +46,11 @@ def put_file(server: Postgres, lease: Lease, name: str, path: Path) -> None:
 
 
 def fetch_snapshot(server: Postgres, lease: Lease, folder: MissionFolder) -> None:
-    """Write the snapshot of the worker before into a mission's folder."""
+    """Write the snapshot of the worker before into a mission's folder, if the disk has room for it."""
     found = fetched(server, lease.mission, SNAPSHOT)
-    with translate_errors(folder.snapshot):
-        if found is None:
-            folder.snapshot.unlink(missing_ok=True)
-        else:
+    with suppress(OSError):  # the disk is full: the worker applies all packets again
+        folder.snapshot.unlink(missing_ok=True)
+        if found is not None:
             write_file(folder.snapshot, found)
 
 
