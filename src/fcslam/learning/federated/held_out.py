@@ -68,8 +68,9 @@ def judge(network: KeypointNetwork, pairs: HeldOutPairs, device: torch.device) -
         _recall(frames[i], frames[j], T_i_j, shared)
         for (i, j, shared), T_i_j in zip(pairs.revisits, between, strict=True)
     ]
-    same = [inliers(frames[i], frames[j]) for i, j, _ in pairs.revisits]
-    other = [inliers(frames[i], frames[j]) for i, j in pairs.apart.tolist()]
+    # Keyframes that are far apart may see the same points, as along a corridor: a motion that says so is no error.
+    same = [inliers(frames[i], frames[j], APART_M) for i, j, _ in pairs.revisits]
+    other = [inliers(frames[i], frames[j], APART_M) for i, j in pairs.apart.tolist()]
     judged = np.full((len(found), len(COLUMNS)), np.nan, np.float32)
     judged[:, 0] = found
     if other:
@@ -118,10 +119,14 @@ def _recall(a: Keyframe, b: Keyframe, T_a_b: FloatArray, shared: int) -> float:
     return min(right / shared, 1.0)
 
 
-def inliers(a: Keyframe, b: Keyframe) -> int:
-    """Keypoints that the best motion between two keyframes explains, as the cloud compares camera places."""
+def inliers(a: Keyframe, b: Keyframe, farthest_m: float = np.inf) -> int:
+    """Keypoints that the best motion between two keyframes explains, as the cloud compares camera places.
+
+    Motions of more than ``farthest_m`` do not count: they do not take the keyframes for one place.
+    """
     positions_a, positions_b = (each.positions[each.placed] for each in (a, b))
     codes_a, codes_b = (each.features.descriptors[each.placed] for each in (a, b))
     matches = level_matches(positions_a, positions_b, mutual_matches(codes_a, codes_b, LARGEST_HAMMING))
     flat = positions_a[:, :2].astype(np.float32), positions_b[:, :2].astype(np.float32)
-    return max((len(inliers) for _, inliers in rigid_hypotheses(*flat, matches)), default=0)
+    found = rigid_hypotheses(*flat, matches)
+    return max((len(rows) for T_a_b, rows in found if np.hypot(*T_a_b[:2]) <= farthest_m), default=0)
