@@ -1,6 +1,7 @@
 """Place recognition: the fleet's index beside brute force and a fixed tree of other images, as DBoW users have it.
 
     FCSLAM_DATA=/path/to/data python benchmarks/places.py --fleets FLEET ...
+    FCSLAM_DATA=/path/to/data python benchmarks/places.py --gate OTHER.onnx ... --results gate
 
 500 features on grey images of 400 pixels; each query answers with its most similar place. Trees of other images are
 trained on photographs and street scenes (k=10, L=4). The network learned from other floors of the tower, so it is
@@ -11,31 +12,47 @@ has it. In brackets: 95 % by bootstrap over queries. LiDAR: places of one robot 
 or less away by its own corrected poses; different is more than 10 m away. FLEET: folders that `fcslam tools simulate`
 recorded, places of each robot against those of robots before it, by how much their views overlap; left out if none is
 given.
+
+--gate compares the bundled network with others, and says nothing else: by the fleet's index on the corridor, the desk
+and floors 11 to 15, where each image is a query for all others. The 20 most similar places are verified, as many as a
+fleet verifies. Differences are those of the bundled network less the other one, paired, with 95 % by bootstrap over
+blocks of ten consecutive queries. A network may take the place of another one if in each set the interval of the
+average precision begins above -0.05, the limit of a fleet's releases.
 """
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import common
+import numpy as np
 from evaluation.place_features import (
     DescribedSet,
     FeatureChoice,
     PairVerifier,
     choose_features,
     choose_scorers,
+    describe_images,
     describe_sets,
     describe_training,
+    strategy_scorer,
 )
-from evaluation.places import SetResult, curves_figure, evaluate_set
+from evaluation.place_sets import read_place_set
+from evaluation.places import SetResult, curves_figure, differences, evaluate_set, measure
 
+from fcslam.features.detector_kinds import DetectorKind
+from fcslam.learning.federated.evaluation import MOST_PLACES_LOST
 from fcslam.metrics.bootstrap import Interval
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
-from fcslam.records import Codes
+from fcslam.records import Codes, FloatArray
 
 TRAINING = ("bsds500", "coco_subset", "urban100", "sun_hays80", "kodak24", "camvid")
 CORRIDOR, DESK, TOWER = "rtabmap_corridor", "tum_rgbd/freiburg1_rpy", "ie_tower"
 UNSEEN_FLOORS = [f"floor{number}" for number in range(11, 16)]
 SEED = 1
+FLEET_CANDIDATES = 20
+SHOWN = ("recall_at_1", "average_precision", "recall_at_full_precision")
+MEASURES = ("R@1", "AP", "R at 100 % precision")
+GATE = {"": "s"} | {f"{each}{name}": "s" for each in ("", "bundled less this: ") for name in MEASURES} | {"passes": "s"}
 
 
 def main() -> None:
@@ -43,9 +60,13 @@ def main() -> None:
     parser.add_argument("--features", nargs="+", default=["orb", "onnx"], help="orb, onnx, .onnx files, folders")
     parser.add_argument("--fleets", nargs="*", type=Path, default=[], help="recorded by fcslam tools simulate")
     parser.add_argument("--no-lidar", action="store_true", help="images only")
+    parser.add_argument("--gate", nargs="+", default=[], help=".onnx files to compare the bundled network with")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)
     images = common.recordings(CORRIDOR, DESK, TOWER, *TRAINING, kind="vision")
+    if chosen.gate:
+        _tell_gate(report, images, chosen.gate)
+        return
     curves: list[SetResult] = []
     for name in chosen.features:
         features = choose_features(name)
@@ -100,8 +121,34 @@ def _rows(result: SetResult, question: str) -> Iterator[tuple[object, ...]]:
         )
 
 
-def _shown(value: Interval) -> str:
-    return f"{value.mean:.3f} [{value.low:.2f}, {value.high:.2f}]"
+def _tell_gate(report: common.Report, images: Path, others: Sequence[str]) -> None:
+    """The report of the gate: each detector on each set, and the bundled network less the other ones."""
+    detectors = [choose_features(name) for name in (DetectorKind.ONNX, *others, DetectorKind.ORB)]
+    for folder in (CORRIDOR, DESK, TOWER):
+        is_tower = folder == TOWER
+        places = read_place_set(images / folder, UNSEEN_FLOORS if is_tower else (), every_image=is_tower)
+        verified = {each.name: _verified(describe_images(places, images / folder, each)) for each in detectors}
+        bundled = next(iter(verified.values()))
+        for question, truth in places.questions.items():
+            rows = list[tuple[object, ...]]()
+            for name, similarity in verified.items():
+                values, _ = measure(similarity, truth, np.random.default_rng(SEED))
+                gains = differences(bundled, similarity, truth, np.random.default_rng(SEED))
+                passes = gains["average_precision"].low > -MOST_PLACES_LOST
+                shown = (*(_shown(values[each]) for each in SHOWN), *(_shown(gains[each], "+") for each in SHOWN))
+                rows.append((name, *shown, "yes" if passes else "no"))
+            asked = int(truth.answerable.sum())
+            report.table(f"{places.name}, {question}: {asked} queries, verified", GATE, rows)
+    report.write()
+
+
+def _verified(described: DescribedSet) -> FloatArray:
+    similarity = strategy_scorer(VocabularyConfig(), SEED)(described)
+    return PairVerifier(described).verified(similarity, FLEET_CANDIDATES)
+
+
+def _shown(value: Interval, sign: str = "") -> str:
+    return f"{value.mean:{sign}.3f} [{value.low:{sign}.2f}, {value.high:{sign}.2f}]"
 
 
 if __name__ == "__main__":

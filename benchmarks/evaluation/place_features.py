@@ -205,14 +205,14 @@ class PairVerifier:
         self._described = described
         self._inliers: dict[tuple[int, int], int] = {}
 
-    def verified(self, similarity: FloatArray) -> FloatArray:
+    def verified(self, similarity: FloatArray, candidates: int = CANDIDATES) -> FloatArray:
         """Verified similarity inliers / (inliers + 20) of the most similar places of every query, else 0: shape (Q, G).
 
-        A pair with at least 0.5 is accepted.
+        A pair with at least 0.5 is accepted. ``candidates``: places of a query that are verified.
         """
         verified = np.zeros(similarity.shape)
         for q, row in enumerate(similarity):
-            best = np.argsort(-row, kind="stable")[:CANDIDATES]
+            best = np.argsort(-row, kind="stable")[:candidates]
             for g in best[row[best] > 0.0]:
                 inliers = self.inliers(q, int(g))
                 verified[q, g] = inliers / (inliers + ACCEPTED_INLIERS)

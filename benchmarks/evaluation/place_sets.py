@@ -61,19 +61,23 @@ class PlaceSet:
 
     @property
     def is_online(self) -> bool:
-        """Whether queries and gallery are one stream in the order of time."""
-        return self.queries == self.gallery
+        """Whether queries and gallery are one stream in the order of time, and each image queries the earlier ones."""
+        return self.queries == self.gallery and not np.triu(self.admitted).any()
 
 
-def read_place_set(folder: Path, labels: Collection[str] = ()) -> PlaceSet:
+def read_place_set(folder: Path, labels: Collection[str] = (), every_image: bool = False) -> PlaceSet:
     """Read the set in a folder; ``labels`` selects images of a set with labels.
+
+    ``every_image``: each image of a set with labels queries all others, where those of one split query the others
+    else. Then a pair of images of a floor's lift, or of its lift and stairs, is not different: the clips of a lift turn
+    round in one lobby and look along the way to the stairs.
 
     Raises:
         InputError: the folder has no known set, its files are inconsistent, or no image has these labels.
         SourceError: a robot's recording cannot be read.
     """
     readers: dict[str, Callable[[], PlaceSet]] = {
-        LABELLED: lambda: _read_tower(folder, labels),
+        LABELLED: lambda: _read_tower(folder, labels, every_image),
         "loop_pairs.txt": lambda: _read_tour(folder),
         "associations.txt": lambda: _read_sequence(folder),
         FLEET: lambda: _read_fleet(folder),
@@ -104,7 +108,7 @@ def _stream(folder: Path, images: tuple[Path, ...], admitted: Pairs, question: s
     return PlaceSet(folder.resolve().name, images, images, admitted, {question: asked})
 
 
-def _read_tower(folder: Path, labels: Collection[str]) -> PlaceSet:
+def _read_tower(folder: Path, labels: Collection[str], every_image: bool) -> PlaceSet:
     with io.StringIO(read_text(folder / LABELLED), newline="") as file:
         rows = [row for row in csv.DictReader(file) if not labels or row["label"] in labels]
     frames = [_FRAME.fullmatch(str(Path(row["image"]).with_suffix(""))) for row in rows]
@@ -114,19 +118,22 @@ def _read_tower(folder: Path, labels: Collection[str]) -> PlaceSet:
     clips = np.array([frame[1] for frame in frames if frame])
     numbers = np.array([int(frame[2]) for frame in frames if frame])
     floors, areas = (np.array([row[key] for row in rows]) for key in ("label", "area"))
-    q, g = (np.flatnonzero([row["split"] == split for row in rows]) for split in ("query", "gallery"))
+    q, g = (np.flatnonzero([every_image or row["split"] == split for row in rows]) for split in ("query", "gallery"))
 
     same_clip = clips[q][:, None] == clips[g]
     apart = np.abs(numbers[q][:, None] - numbers[g])
     same_floor, same_area = floors[q][:, None] == floors[g], areas[q][:, None] == areas[g]
-    matches = same_clip & (apart <= SAME_CLIP_FRAMES)
-    within = (same_floor & ~same_area) | (same_clip & (apart > OTHER_CLIP_FRAMES))
+    admitted = q[:, None] != g
+    matches = same_clip & (apart <= SAME_CLIP_FRAMES) & admitted
+    lift, beside = areas == "elevator", np.isin(areas, ("elevator", "stairs"))
+    one_lobby = every_image & same_floor & ((lift[q][:, None] & beside[g]) | (beside[q][:, None] & lift[g]))
+    within = ((same_floor & ~same_area) | (same_clip & (apart > OTHER_CLIP_FRAMES))) & ~one_lobby
     paths = [folder / row["image"] for row in rows]
     return PlaceSet(
-        folder.resolve().name,
+        folder.resolve().name + (", every image" if every_image else ""),
         tuple(paths[i] for i in q),
         tuple(paths[i] for i in g),
-        np.ones_like(matches),
+        admitted,
         {"within a floor": PairTruth(matches, within), "near": PairTruth(matches, ~same_floor)},
     )
 

@@ -29,6 +29,8 @@ from .retrieval import (
 RANKS: Final = (1, 5, 10)
 DRAWS: Final = 300
 """Bootstrap samples of a measure that is no mean."""
+QUERY_BLOCK: Final = 10
+"""Consecutive queries that a comparison of two networks draws together."""
 
 COLOURS: Final = (
     "#000000",
@@ -141,13 +143,40 @@ def measure(
     return measures, retrieved
 
 
-def measure_interval(measure: Callable[[NDArray[np.int64]], float], count: int, rng: np.random.Generator) -> Interval:
+def differences(
+    similarity: FloatArray, other: FloatArray, truth: PairTruth, rng: np.random.Generator
+) -> dict[str, Interval]:
+    """Measures of similarities (Q, G) less those of others, of the single best matches, by the names of ``Score``.
+
+    The intervals are paired, over blocks of consecutive queries: images of one drive that follow each other are alike.
+    """
+    first, second = single_best(similarity, truth), single_best(other, truth)
+    gain = np.where(truth.answerable, first.right - second.right, np.nan)
+    of: dict[str, Callable[[NDArray[np.int64]], float]] = {
+        "recall_at_1": lambda rows: float(np.nanmean(gain[rows])),
+        "average_precision": lambda rows: first.curve(rows).average_precision - second.curve(rows).average_precision,
+        "recall_at_full_precision": lambda rows: (
+            first.curve(rows).recall_at_full_precision - second.curve(rows).recall_at_full_precision
+        ),
+    }
+    return {name: measure_interval(value, len(similarity), rng, QUERY_BLOCK) for name, value in of.items()}
+
+
+def measure_interval(
+    measure: Callable[[NDArray[np.int64]], float], count: int, rng: np.random.Generator, block: int = 1
+) -> Interval:
     """Any measure of ``count`` samples, and its interval by percentile bootstrap.
 
-    ``measure`` is given the indices (N,) of samples; draws with NaN are ignored.
+    ``measure`` is given the indices (N,) of samples; draws with NaN are ignored. ``block`` consecutive samples are
+    drawn together.
     """
     whole = measure(np.arange(count))
-    drawn = np.array([measure(rng.integers(count, size=count)) for _ in range(DRAWS if count else 0)])
+
+    def draw() -> NDArray[np.int64]:
+        starts = rng.integers(count, size=-(-count // block))
+        return ((starts[:, None] + np.arange(block)) % count).ravel()[:count]
+
+    drawn = np.array([measure(draw()) for _ in range(DRAWS if count else 0)])
     known = drawn[np.isfinite(drawn)]
     if not len(known):
         return Interval(whole, np.nan, np.nan)

@@ -46,10 +46,10 @@ def tour(folder, images=50, first_again=30):
 
 
 def tower(folder):
-    """Two floors, two areas each, clips of 20 frames of which every tenth is a query; no images."""
+    """Two floors, three areas each, clips of 20 frames of which every tenth is a query; no images."""
     lines = ["image,label,split,area,section,floor_range"]
     for floor in ("floor1", "floor2"):
-        for area in ("stairs", "hall"):
+        for area in ("stairs", "hall", "elevator"):
             for frame in range(1, 21):
                 split = "query" if frame % 10 == 0 else "gallery"
                 lines.append(f"{floor}/{floor}_{area}_frame_{frame:06d}.jpg,{floor},{split},{area},x,y")

@@ -13,7 +13,8 @@ from evaluation.place_features import (
     strategy_scorer,
 )
 from evaluation.place_sets import read_place_set
-from evaluation.retrieval import recall_at
+from evaluation.places import differences
+from evaluation.retrieval import PairTruth, recall_at, single_best
 
 from fcslam.cli import main
 from fcslam.features.codes import hamming_matrix
@@ -91,3 +92,21 @@ def test_extracted_features_are_those_of_the_detector(folders, tmp_path):
     assert all(len(place.descriptors) for place in (*found.queries, *found.gallery))
     (truth,) = found.place_set.questions.values()
     assert recall_at(brute_force(found), truth, 1).tolist() == [1.0] * 5
+
+
+def test_a_comparison_is_paired():
+    rng = np.random.default_rng(1)
+    same = np.repeat(np.eye(20, dtype=bool), 3, axis=0)
+    truth = PairTruth(same, ~same)
+    good, poor = (same * share + rng.uniform(0.0, 1.0, same.shape) for share in (1.0, 0.5))
+    assert set(differences(poor, poor, truth, rng).values()) == {(0.0, 0.0, 0.0)}
+    ahead, behind = (differences(*pair, truth, rng) for pair in ((good, poor), (poor, good)))
+    for name, gain in ahead.items():
+        assert gain.low <= gain.mean <= gain.high
+        assert gain.mean == pytest.approx(-behind[name].mean)
+    first, second = (single_best(each, truth) for each in (good, poor))
+    assert ahead["average_precision"].mean == first.curve().average_precision - second.curve().average_precision
+    assert ahead["recall_at_1"].mean == pytest.approx(
+        recall_at(good, truth, 1).mean() - recall_at(poor, truth, 1).mean()
+    )
+    assert ahead["recall_at_1"].low > 0.0
