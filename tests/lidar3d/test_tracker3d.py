@@ -43,7 +43,7 @@ def test_a_plain_corridor_says_nothing_along_its_axis_and_wheels_hold_it() -> No
     )
     tracker = Tracker3d()
     found = errors(tracker, drive(corridor, lambda t: np.array([0.5 * t, 0.0, 0.0]), 40))
-    assert np.abs(found[:, 0]).max() < 0.03
+    assert np.abs(found[:, 0]).max() < 0.05
     scan, _ = next(drive(corridor, lambda t: np.array([2.0 + 0.5 * t, 0.0, 0.0]), 1))
     information = tracker.track(replace(scan, stamp=4.0, wheels=scan.wheels + np.array([4.0, 0.0, 0.0, 0.0]))).measured
     assert information[0, 0] < 1e-3 * information[1, 1]

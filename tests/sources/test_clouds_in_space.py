@@ -109,7 +109,7 @@ def test_clouds_that_cannot_be_mapped_are_refused_in_one_line(tmp_path, changes,
 @pytest.mark.parametrize(
     ("changes", "note"),
     [
-        ({"layout": (12, xyz())}, "the points have no times.*the order of the points gives their times"),
+        ({"layout": (12, xyz())}, "the points have no times; their order gives them"),
         ({"R": rotation(roll=np.pi)}, "the LiDAR is upside down; corrected"),
         ({"mounting": (0.0, 0.0, 3.0)}, "no floor is seen where the mounting has it"),
     ],
@@ -164,7 +164,8 @@ def test_folders_of_clouds_are_recordings(tmp_path, kind):
     (source,) = open_fleet([(Path(tmp_path), "anna")], IN_3D)
     scans = list(source.records())
     assert [each.stamp for each in scans] == pytest.approx(0.1 * np.arange(12))
-    assert scans[3].points_m - scans[3].origin_m.astype(np.float32) == pytest.approx(made[3], abs=1e-5)
+    outside = np.hypot(made[3][:, 0], made[3][:, 1]) > 0.4
+    assert scans[3].points_m - scans[3].origin_m.astype(np.float32) == pytest.approx(made[3][outside], abs=1e-5)
     assert scans[3].origin_m[2] == pytest.approx(0.4, abs=0.02)
     with pytest.raises(SourceError, match="map them with --3d"):
         open_fleet([(Path(tmp_path), "anna")])

@@ -11,17 +11,19 @@ import numpy as np
 
 from fcslam.compiled import njit
 from fcslam.geometry import se3
+from fcslam.lidar3d.surfels import FEWEST_POINTS, THICKEST_M
 from fcslam.records import FloatArray, LaserModel, Ranges
+from fcslam.sources.point_clouds import CloudBand
 
 _REACH_M, _NEAR_M = 4.0, 0.15
 """Points of the floor at the robot: within this distance, and this height above or below where its wheels stand."""
-_FEWEST, _LEAST_EXTENT_M = 40, 0.3
-_THICKEST_M: Final = 0.04
+_LEAST_EXTENT_M: Final = 0.3
+"""Least standard deviation of the points of a floor in every direction."""
 _SAME_FLOOR: Final = cos(radians(3.0))
 """Floors that lean by less against the vertical are level."""
-_RATE, _FIRST_RATE = 0.02, 0.2
-"""Share of a new measurement in the vertical, at most and at least at first."""
-_BAND_M: Final = (0.2, 0.6)
+_RATE: Final = 0.02
+"""Least share of a new measurement in the vertical."""
+_BAND: Final = CloudBand(low_m=0.2)
 """Heights above the floor of what a 2D laser sees."""
 _CELL_M, _CELLS = 0.5, 64
 """Side of a cell of the heights of the floor, and cells along a side of their square."""
@@ -32,17 +34,16 @@ _STEP_M: Final = 0.12
 def floor_at(points: FloatArray) -> tuple[FloatArray, float] | None:
     """Normal (3,) and distance of the floor below the base, from points (N, 3) in ``base``; None if few show it."""
     near = points[(np.abs(points[:, 2]) < _NEAR_M) & (np.hypot(points[:, 0], points[:, 1]) < _REACH_M)]
-    if len(near) < _FEWEST:
-        return None
     for _ in range(2):
+        if len(near) < FEWEST_POINTS:
+            return None
         middle = near.mean(axis=0)
         variances, axes = np.linalg.eigh(np.cov((near - middle).T))
         normal = axes[:, 0] * np.copysign(1.0, axes[2, 0])
         off = np.abs((near - middle) @ normal)
         near = near[off < max(2.0 * np.sqrt(variances[0]), 0.02)]
-        if len(near) < _FEWEST or variances[1] < _LEAST_EXTENT_M**2:
-            return None
-    return None if variances[0] > _THICKEST_M**2 else (normal, float(normal @ middle))
+    is_floor = variances[1] > _LEAST_EXTENT_M**2 and variances[0] < THICKEST_M**2
+    return (normal, float(normal @ middle)) if is_floor else None
 
 
 class Vertical:
@@ -58,7 +59,7 @@ class Vertical:
         if self._count and direction @ self.up < _SAME_FLOOR:
             return
         self._count += 1
-        rate = max(_RATE, min(1.0 / self._count, _FIRST_RATE if self._count > 1 else 1.0))
+        rate = max(_RATE, 1.0 / self._count)
         self.up = self.up + rate * (direction - self.up)
         self.up /= np.linalg.norm(self.up)
 
@@ -81,7 +82,7 @@ def seen_by(laser: LaserModel, points: FloatArray, around: FloatArray) -> Ranges
     0: nothing is measured. The points ``around`` (M, 3) show the floor.
     """
     heights = points[:, 2] - _floor_below(points, _floor_heights(around, _CELLS, _CELL_M, _STEP_M), _CELL_M)
-    seen = points[(heights > _BAND_M[0]) & (heights < _BAND_M[1])]
+    seen = points[(heights > _BAND.low_m) & (heights < _BAND.high_m)]
     distances = np.hypot(seen[:, 0], seen[:, 1])
     angles = np.arctan2(seen[:, 1], seen[:, 0])
     beams = np.rint((angles - laser.angle_min_rad) / laser.angle_increment_rad).astype(np.int64) % laser.beam_count

@@ -1,16 +1,16 @@
 """Keyframes of a robot with a 3D LiDAR, the motions between them, and local maps of several keyframes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from fcslam.geometry import se3
-from fcslam.geometry.voxels import to_steps, voxelised
+from fcslam.geometry.voxels import VOXEL_STEPS, to_steps, voxelised
 from fcslam.lidar3d.ground import Vertical, floor_at, levelled
 from fcslam.lidar3d.surfels import SurfelMap
-from fcslam.lidar3d.tracker import Tracked, fit_rigid, inverse, thinned
-from fcslam.records import FloatArray, KeyscanId, VoxelMap
+from fcslam.lidar3d.tracker import MOST_POINTS, Tracked, fit_rigid, inverse, thinned
+from fcslam.records import STEP_M, FloatArray, KeyscanId, VoxelMap
 
 _STEP_M, _STEP_RAD = 0.5, 0.4
 """Motion after which a turn of the LiDAR is a keyframe."""
@@ -18,9 +18,8 @@ _LOCAL_MAP_M: Final = 2.5
 """Travel from one local map to the next."""
 _REACH: Final = 6
 """Keyframes before and after that of a local map whose points it has."""
-_CELL_M: Final = 0.1
+_CELL_M: Final = VOXEL_STEPS * STEP_M
 """A keyframe keeps one point in each such cell."""
-_FARTHEST_M: Final = 25.0
 _DRIFT: Final = np.array([1e-3] * 3 + [5e-4] * 3)
 """Standard deviations that every motion between keyframes has at least."""
 _APART_M: Final = 12.0
@@ -98,12 +97,11 @@ class Keyframes:
             self.vertical.add(rotation @ floor[0])
         elif force is not None:
             self.vertical.add(rotation @ force)
-        near = tracked.points[np.linalg.norm(tracked.points, axis=1) < _FARTHEST_M]
         self.newest = MappedTurn(
             number,
             tracked.T_odom_base,
             travel_m,
-            near[thinned(near, _CELL_M)],
+            tracked.points[thinned(tracked.points, _CELL_M)],
             tracked.origin,
             0.0 if floor is None else -floor[1],
         )
@@ -177,12 +175,13 @@ class SurfaceMaps:
         found = []
         for old in self._candidates(new):
             start = se3.between(old.anchor.T_odom_base, new.anchor.T_odom_base)
-            chosen = new.points[thinned(new.points, 2.0 * _CELL_M)]
+            chosen = new.points[thinned(new.points, 2.0 * _CELL_M, MOST_POINTS)]
             T, measured, on_surface, near = fit_rigid(old.surfels(), chosen, start)
             if on_surface > _EXPLAINED * near and near > _OVERLAP * len(chosen):
                 covariance = inverse(measured + np.diag(_UNMEASURED**-2)) + np.diag(_CLOSURE_SIGMA**2)
                 found.append(KeyframeMotion(old.anchor.number, new.anchor.number, T, inverse(covariance)))
-        self._maps.append(new)
+        kept = thinned(new.points, _CELL_M)  # several keyframes saw the same
+        self._maps.append(replace(new, points=new.points[kept], scans=new.scans[kept]))
         return found
 
     def _candidates(self, new: SurfaceMap) -> list[SurfaceMap]:

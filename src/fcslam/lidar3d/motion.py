@@ -19,11 +19,10 @@ _ACCELERATION: Final = np.array([1.0, 1.0, 1.0, 3.0, 3.0, 5.0])
 each."""
 _UNKNOWN: Final = np.array([1.0, 1.0, 0.3, 0.3, 0.3, 1.5])
 """The same of the velocity before anything is known about it, m/s and rad/s."""
-_LIFT_SHARE, _TILT_RAD = 0.02, 0.03
-"""Standard deviations of wheels in the directions that they do not measure: height per travel; roll and pitch."""
+_TILT_RAD: Final = 0.03
+"""Standard deviation of roll and pitch, which wheels do not measure; heights are as certain as positions."""
 _GYRO_RAD, _GYRO_SHARE = 1e-3, 0.01
 """Standard deviation of a rotation by gyro: of a turn of the LiDAR, and per radian."""
-_LEAST_M: Final = 2e-3
 _AT_REST: Final = 1e-3
 """Metres and radians in a turn below which a robot stands still."""
 
@@ -77,10 +76,7 @@ class MotionSensors:
             turns = np.column_stack((np.zeros((len(steps), 2)), steps[:, 2]))
             moved_m = float(np.hypot(*planar[:2]))
             error = self.trust.scale(odometry_error(moved_m, abs(planar[2]), WHEELS))
-            least = _LEAST_M * min(1.0, length_s * 10.0)
-            sigma = np.array(
-                [error.position_m] * 2 + [least + _LIFT_SHARE * moved_m, *2 * [_TILT_RAD], error.heading_rad]
-            )
+            sigma = np.array([*3 * [error.position_m], *2 * [_TILT_RAD], error.heading_rad])
         if covers(self._imu, times):
             turned = integral(self._imu[:, 0], self._imu[:, 1:4], times)
             rotation = turned[-1]

@@ -20,18 +20,12 @@ SIZES_M: Final = (0.8, 0.4, 0.2)
 """Edges of the voxels, from the largest on."""
 POINT_SIGMA_M: Final = 0.02
 """Standard deviation of a point along the normal of its surface."""
-_THICKEST_M: Final = 0.035
+THICKEST_M: Final = 2.0 * POINT_SIGMA_M
 """Largest standard deviation of the points of a surfel along its normal."""
-_FEWEST: Final = 6
+FEWEST_POINTS: Final = 6
 """Least number of points of a surfel."""
 _WIDEST_RATIO: Final = 0.06
 """Largest ratio of the two smallest variances of the points of a surfel: along the normal, and across."""
-_NOISE_M: Final = 0.01
-"""Least standard deviation of points along a normal in the error of that normal."""
-
-_STATS, _PLANE = 13, 8
-"""Numbers of a voxel: count, sums, products and rays of its points; normal, middle, variance along the normal, and
-variance of the normal."""
 _OFFSET = 1 << 19
 
 
@@ -40,8 +34,10 @@ class SurfelMap:
 
     def __init__(self) -> None:
         self._keys, self._rows = _table(1 << 12)
-        self._stats = np.zeros((1 << 10, _STATS))
-        self._planes = np.zeros((1 << 10, _PLANE))
+        self._stats = np.zeros((1 << 10, 13))
+        """Of each voxel: the number of its points, and the sums of them, of their products and of their rays."""
+        self._planes = np.zeros((1 << 10, 8))
+        """Normal, middle, variance along the normal (0: there is no surfel), and variance of the normal."""
         self._seen = np.zeros(1 << 10)
         self._row_keys = np.zeros(1 << 10, np.int64)
         self.count = 0
@@ -189,7 +185,7 @@ def _fit_planes(stats, planes, rows):  # type: ignore[no-untyped-def]
     for row in rows:
         s, plane = stats[row], planes[row]
         n = s[0]
-        if n < _FEWEST:
+        if n < FEWEST_POINTS:
             continue
         mx, my, mz = s[1] / n, s[2] / n, s[3] / n
         C[0, 0], C[0, 1], C[0, 2] = s[4] / n - mx * mx, s[5] / n - mx * my, s[6] / n - mx * mz
@@ -197,7 +193,7 @@ def _fit_planes(stats, planes, rows):  # type: ignore[no-untyped-def]
         C[1, 0], C[2, 0], C[2, 1] = C[0, 1], C[0, 2], C[1, 2]
         values, vectors = np.linalg.eigh(C)
         thin = max(values[0], 0.0)
-        if thin > _THICKEST_M**2 or thin > _WIDEST_RATIO * values[1]:
+        if thin > THICKEST_M**2 or thin > _WIDEST_RATIO * values[1]:
             plane[6] = 0.0
             continue
         nx, ny, nz = vectors[0, 0], vectors[1, 0], vectors[2, 0]
@@ -205,7 +201,7 @@ def _fit_planes(stats, planes, rows):  # type: ignore[no-untyped-def]
             nx, ny, nz = -nx, -ny, -nz
         plane[0], plane[1], plane[2], plane[3], plane[4], plane[5] = nx, ny, nz, mx, my, mz
         plane[6] = POINT_SIGMA_M**2 + thin / n
-        plane[7] = max(thin, _NOISE_M**2) / (n * values[1])
+        plane[7] = max(thin, 0.25 * POINT_SIGMA_M**2) / (n * values[1])
 
 
 @njit(allocates=False)

@@ -14,20 +14,16 @@ from numpy.typing import NDArray
 from fcslam.compiled import njit
 from fcslam.geometry import se3
 from fcslam.lidar3d.motion import MotionSensors
-from fcslam.lidar3d.surfels import SurfelMap
+from fcslam.lidar3d.surfels import POINT_SIGMA_M, SurfelMap
 from fcslam.records import CloudScan, FloatArray
+from fcslam.sources.point_clouds import FARTHEST_M
 
 _STEPS: Final = 10
 """Parts of a turn between whose ends the predicted motion is interpolated."""
-_CELL_M, _MOST_POINTS = 0.2, 3000
+_CELL_M, MOST_POINTS = 0.2, 3000
 """Points that are registered: one for each such cell, or for larger ones if there are more."""
-FARTHEST_M: Final = 60.0
-"""Farther points are not used."""
-_NEAREST_M: Final = 0.3
-GATES_M: Final = (0.4, 0.1)
-"""Largest distance of a point from its surface, at first and in the end."""
-_GATE_FACTOR: Final = 0.7
-_ITERATIONS: Final = 10
+_GATES_M: Final = (0.4, 0.28, 0.2, 0.14, 0.1, 0.1, 0.1, 0.1, 0.1)
+"""Largest distance of a point from its surface in each iteration."""
 _CONVERGED: Final = 1e-4
 _ON_SURFACE_M, _NEAR_SURFACE_M = 0.06, 0.5
 """Of the points that are near a surface, most are on it if the registration is right."""
@@ -39,17 +35,14 @@ LEVER_M: Final = 5.0
 """Usual distance of a point: it makes rotations and translations comparable."""
 _POOR_FACTOR, _POOR_LEAST = 3.0, 0.02
 """A registration is poor if more points than the second number, and this many times the usual, miss their surface."""
-_USUAL_RATE: Final = 0.1
-_SETTLED: Final = 20
+SETTLED: Final = 20
 """Turns after which it is known what is usual."""
-_JOLT_RAD, _JOLT_M = 0.08, 0.02
-"""Standard deviations of a sudden tilt, as at the edge of a ramp, and of the shift with it."""
-_JOLTS_RAD: Final = (0.06, 0.12, -0.06, -0.12)
-"""Sudden tilts about the y axis that are tried."""
+_JOLT_RAD: Final = 0.08
+"""Standard deviation of a sudden tilt, as at the edge of a ramp."""
+_JOLTS: Final = np.array([0.75, 1.5, -0.75, -1.5])
+"""Sudden tilts about the y axis that are tried, in standard deviations."""
 _MAP_SIGMA: Final = np.array([2e-3] * 3 + [1e-3] * 3)
 """Standard deviations of the error of the map."""
-_BEGINNINGS: Final = 2
-"""Times that the first two turns are registered anew: the second one shows the motion in the first."""
 _INSERT_M, _TURN_M = 0.1, 0.3
 """Travel after which a turn is added to the map; what a radian counts as travel."""
 _REMEMBERED_M: Final = 20.0
@@ -116,7 +109,7 @@ class Tracker3d:
             self._first = scan
         elif self._first is not None:
             first, self._first = self._first, None
-            for _ in range(_BEGINNINGS):
+            for _ in range(2):  # the second turn shows the motion in the first, better each time
                 self._begin()
                 self._register(first)
                 tracked = self._register(scan)
@@ -124,7 +117,7 @@ class Tracker3d:
 
     def _register(self, scan: CloudScan) -> Tracked:
         distances = np.linalg.norm(scan.points_m - scan.origin_m.astype(np.float32), axis=1)
-        used = (distances > _NEAREST_M) & (distances < FARTHEST_M)
+        used = distances < FARTHEST_M
         points, times = scan.points_m[used].astype(np.float64), scan.times_s[used].astype(np.float64)
         first_s, last_s = (float(times.min()), float(times.max())) if len(times) else (0.0, 0.0)
         length_s = max(last_s - first_s, 1e-3)
@@ -133,7 +126,7 @@ class Tracker3d:
         predicted = self.sensors.predict(begin_s + np.linspace(0.0, length_s, _STEPS + 1))
         shares = (times - first_s) / length_s
         deskewed = _deskew(points, shares, predicted.poses)
-        chosen = thinned(deskewed, _CELL_M)
+        chosen = thinned(deskewed, _CELL_M, MOST_POINTS)
         fit = self._fitted(deskewed[chosen], shares[chosen], T_odom_begin, predicted.poses[-1], predicted.sigma)
         begin = se3.compose(T_odom_begin, se3.exp(fit.corrections[0]))
         end = se3.compose(T_odom_begin, se3.compose(se3.exp(fit.corrections[1]), predicted.poses[-1]))
@@ -141,7 +134,7 @@ class Tracker3d:
         self._covariance = to_end @ fit.covariance[6:, 6:] @ to_end.T
         motion = se3.between(begin, end)
         if self._is_poor:
-            self._covariance += np.diag([_JOLT_M**2] * 3 + [_JOLT_RAD**2] * 2 + [_JOLT_M**2])
+            self._covariance += np.diag([POINT_SIGMA_M**2] * 3 + [_JOLT_RAD**2] * 2 + [POINT_SIGMA_M**2])
         else:
             sigma_rad = float(np.sqrt(np.trace(self._covariance[3:, 3:]) / 3.0))
             is_fixed = bool(np.linalg.eigvalsh(fit.measured[:3, :3])[0] * 9.0 * predicted.sigma[0] ** 2 > 1.0)
@@ -192,17 +185,17 @@ class Tracker3d:
             return _fit(self._map, points, shares, T_odom_begin, inverse(covariance), motion_information, start)
 
         first = fit(self._covariance, sigma)
-        tries = [fit(self._covariance, sigma, tilt) for tilt in _JOLTS_RAD] if self._is_poor else []
+        tries = [fit(self._covariance, sigma, tilt) for tilt in _JOLT_RAD * _JOLTS] if self._is_poor else []
         best = max((first, *tries), key=lambda each: each.on_surface)
-        self._is_poor = self._turns > _SETTLED and 1.0 - best.share > _POOR_FACTOR * (1.0 - self._usual) + _POOR_LEAST
+        self._is_poor = self._turns > SETTLED and 1.0 - best.share > _POOR_FACTOR * (1.0 - self._usual) + _POOR_LEAST
         if self._is_poor:
             loose = sigma.copy()
             loose[3:5] = np.maximum(loose[3:5], _JOLT_RAD)
             tilted = self._covariance.copy()
             tilted[4, 4] += _JOLT_RAD**2
-            tries = [fit(self._covariance, loose), *(fit(tilted, loose, tilt) for tilt in _JOLTS_RAD)]
+            tries = [fit(self._covariance, loose), *(fit(tilted, loose, tilt) for tilt in _JOLT_RAD * _JOLTS)]
             return max((best, *tries), key=lambda each: each.on_surface)
-        self._usual += _USUAL_RATE * (best.share - self._usual)
+        self._usual += 2.0 / SETTLED * (best.share - self._usual)
         return best
 
     def _insert(self, points: FloatArray, origin: FloatArray, motion: FloatArray) -> None:
@@ -231,8 +224,8 @@ def _fit(
     prior[6:, 6:] = motion_information
     prior[:6, 6:] = prior[6:, :6] = -motion_information
     rotation, position = se3.rotation(T), T[:3].copy()
-    corrections, gate_m = np.concatenate((start, start)), GATES_M[0]
-    for _ in range(_ITERATIONS):
+    corrections = np.concatenate((start, start))
+    for gate_m in _GATES_M:
         H, b, noise, _ = surfaces.normal_equations(
             points, shares, rotation, position, corrections.reshape(2, 6), gate_m
         )
@@ -240,9 +233,8 @@ def _fit(
         H, b = _CORRELATED * (trusted @ H @ trusted.T), _CORRELATED * (trusted @ b)
         step = np.linalg.solve(H + prior, -(b + prior @ corrections))
         corrections = corrections + step
-        if gate_m == GATES_M[1] and np.abs(step).max() < _CONVERGED:
+        if gate_m == _GATES_M[-1] and np.abs(step).max() < _CONVERGED:
             break
-        gate_m = max(gate_m * _GATE_FACTOR, GATES_M[1])
     near, on = (
         surfaces.normal_equations(points, shares, rotation, position, corrections.reshape(2, 6), gate_m)[3]
         for gate_m in (_NEAR_SURFACE_M, _ON_SURFACE_M)
@@ -328,10 +320,10 @@ def _corrected(points, shares, corrections):  # type: ignore[no-untyped-def]
     return moved
 
 
-def thinned(points: FloatArray, cell_m: float) -> NDArray[np.int64]:
-    """Rows of the first point in each cell, with cells so large that there are few."""
+def thinned(points: FloatArray, cell_m: float, most: int | None = None) -> NDArray[np.int64]:
+    """Rows of the first point in each cell, with larger cells if there are more than ``most``."""
     rows: NDArray[np.int64] = _first_in_cells(points, cell_m)
-    while len(rows) > _MOST_POINTS:
+    while most is not None and len(rows) > most:
         cell_m *= 1.25
         rows = rows[_first_in_cells(points[rows], cell_m)]
     return rows

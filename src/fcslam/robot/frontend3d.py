@@ -5,7 +5,6 @@ Packets are those of a robot with a 2D laser, with motions in six degrees of fre
 """
 
 from collections import deque
-from typing import Final
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.voxel_map import columns
 from fcslam.lidar3d.ground import levelled, seen_by
 from fcslam.lidar3d.local_maps import KeyframeMotion, Keyframes, MappedTurn, SurfaceMap, SurfaceMaps
-from fcslam.lidar3d.tracker import Tracked, Tracker3d
+from fcslam.lidar3d.tracker import SETTLED, Tracked, Tracker3d
 from fcslam.records import (
     Channel,
     CloudScan,
@@ -35,11 +34,6 @@ from fcslam.sources.clouds_in_space import BAND_LASER
 from fcslam.sources.gate import MAX_STEP_BACK_S
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.quantisation import rounded
-
-_LOST_TURNS: Final = 20
-"""Turns in a row that the surfaces explain badly after which the robot is lost."""
-_LONGEST_GAP_S: Final = 2.0
-"""Longest time between turns over which the motion is predicted without wheels."""
 
 
 class RobotFrontend3d:
@@ -73,7 +67,7 @@ class RobotFrontend3d:
         """Process the next record of the recording; returns the packets that are ready."""
         if isinstance(record, CloudScan):
             gap_s = record.stamp - self._stamp
-            if gap_s < -MAX_STEP_BACK_S or (gap_s > _LONGEST_GAP_S and not len(record.wheels)):
+            if gap_s < -MAX_STEP_BACK_S or (gap_s > MAX_STEP_BACK_S and not len(record.wheels)):
                 self.begin_session()
             if record.new_floor:
                 self.change_floor(record.new_floor)
@@ -113,7 +107,7 @@ class RobotFrontend3d:
     def _track(self, scan: CloudScan) -> None:
         tracked = self.newest = self._tracker.track(scan)
         self._poor = self._poor + 1 if tracked.is_poor else 0
-        if self._poor > _LOST_TURNS:
+        if self._poor > SETTLED:  # the surfaces do not explain where it is any more
             self.scan_poses.cut(self._certain_s)
             self.begin_session()
             self._stamp = scan.stamp

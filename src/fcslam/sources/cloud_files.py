@@ -15,22 +15,21 @@ import numpy as np
 
 from fcslam.errors import SourceError
 from fcslam.records import CloudScan, SensorRecord
-from fcslam.sources.bags.clouds import TIMES, timed
+from fcslam.sources.bags.clouds import MOST_POINTS, TIMES, timed
+from fcslam.sources.bags.messages import LONGEST_SWEEP_S
 from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, reader_of
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import FIRST_MESSAGES, scan_window
 from fcslam.sources.logs.archive import translate_errors
-from fcslam.sources.point_clouds import CloudMounting, PointCloud
+from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 SUFFIXES: Final = (".bin", ".pcd", ".ply")
 _TIME_FILES: Final = ("times.txt", "timestamps.txt")
 _PERIOD_S: Final = 0.1
-_LONGEST_TURN_S: Final = 0.25
-_MOST_BYTES: Final = 1 << 28
+_MOST_BYTES: Final = 32 * MOST_POINTS
 _UNITS: Final = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (0.0, 1.0))
 """Least stamp in each unit, and the unit in seconds."""
-_KITTI_COLUMNS: Final = 4
 _PLY_TYPES: Final = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -85,7 +84,7 @@ class CloudFolder:
         step = max(1, len(self._files) // FIRST_MESSAGES)
         first = [self._cloud(number) for number in range(0, len(self._files), step)[:FIRST_MESSAGES]]
         mounting = CloudMounting(np.eye(3), np.zeros(3), 0.0, is_height_known=False)
-        return reader_of(first, mounting, str(self.path))
+        return reader_of(first, mounting, CloudBand(), str(self.path))
 
     def _cloud(self, number: int) -> PointCloud:
         return read_cloud(self._files[number], self._stamps[number])
@@ -126,11 +125,11 @@ def read_cloud(path: Path, stamp: float) -> PointCloud:
     measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
     cloud = PointCloud(stamp, "", points[measured], np.empty(0))
     name = next((name for name in TIMES if name in values), None)
-    return cloud if name is None else timed(cloud, np.asarray(values[name])[measured], _LONGEST_TURN_S)
+    return cloud if name is None else timed(cloud, np.asarray(values[name])[measured], LONGEST_SWEEP_S)
 
 
 def _kitti(content: bytes) -> dict[str, Any]:
-    values = np.frombuffer(content, "<f4").reshape(-1, _KITTI_COLUMNS)
+    values = np.frombuffer(content, "<f4").reshape(-1, 4)  # the last one is the intensity
     return {"x": values[:, 0], "y": values[:, 1], "z": values[:, 2]}
 
 

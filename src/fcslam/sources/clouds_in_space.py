@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
 from fcslam.records import CloudScan, FloatArray, LaserModel, frozen
-from fcslam.sources.point_clouds import DIRECTIONS, FARTHEST_M, CloudMounting, PointCloud, floor_in, turn_of
+from fcslam.sources.point_clouds import DIRECTIONS, FARTHEST_M, CloudBand, CloudMounting, PointCloud, floor_in, turn_of
 
 BAND_LASER: Final = LaserModel(DIRECTIONS // 2, -np.pi, 2.0 * tau / DIRECTIONS, FARTHEST_M)
 """The 2D laser in ``base`` that a 3D LiDAR stands for."""
@@ -19,8 +19,6 @@ _TOO_FAR_M: Final = 300.0
 """Usual distance of points that are not in metres."""
 _ONE_RING_RAD: Final = 0.02
 """Largest spread of the elevations of the points of one ring."""
-_OVERLAP: Final = 1.5
-"""A turn that takes longer than this many times the time between turns has wrong times."""
 _FLOOR_M, _FLOOR_SHARE = 0.15, 0.05
 """Points this near to a plane are on it; least share of the points that are on a floor."""
 _BELOW_SHARE, _OPENINGS = 0.1, 10.0
@@ -36,7 +34,9 @@ class CloudReader:
     is_timed: bool
     """Whether the times of the points count."""
     period_s: float
-    """Time between clouds; 0 if unknown. Without other times, points in order have equal steps of it; 0: no order."""
+    """Time between clouds. Without other times, points in order have equal steps of it; 0: they are in no order."""
+    body_radius_m: float
+    """Points nearer to the vertical through ``base`` are of the robot itself."""
 
     def scan(self, cloud: PointCloud, wheels: FloatArray, imu: FloatArray) -> CloudScan:
         """The record of a cloud with the readings since the one before; raises ValueError if it has few points."""
@@ -48,17 +48,20 @@ class CloudReader:
             times = cloud.times_s
         elif self.period_s > 0.0:
             times = np.linspace(0.0, self.period_s, len(points), endpoint=False)
+        outside = np.hypot(points[:, 0], points[:, 1]) > self.body_radius_m
         return CloudScan(
             cloud.stamp,
-            frozen(points, np.float32),
-            frozen(times, np.float32),
+            frozen(points[outside], np.float32),
+            frozen(times[outside], np.float32),
             frozen(self.mounting.position_m),
             frozen(wheels),
             frozen(imu),
         )
 
 
-def reader_of(first: Sequence[PointCloud], mounting: CloudMounting, where: str) -> tuple[CloudReader, tuple[str, ...]]:
+def reader_of(
+    first: Sequence[PointCloud], mounting: CloudMounting, band: CloudBand, where: str
+) -> tuple[CloudReader, tuple[str, ...]]:
     """How to read clouds like the ``first`` ones of a sensor, and notes about them; messages begin with ``where``.
 
     Raises:
@@ -76,16 +79,7 @@ def reader_of(first: Sequence[PointCloud], mounting: CloudMounting, where: str) 
     notes = []
     stamps = np.array([cloud.stamp for cloud in first])
     period_s = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    lengths = [float(np.ptp(cloud.times_s)) for cloud in first if len(cloud.times_s)]
-    is_timed = bool(lengths)
-    if is_timed and period_s > 0.0 and np.median(lengths) > _OVERLAP * period_s:
-        is_timed = False
-        notes.append(
-            f"{where}: the times of the points span {np.median(lengths):.3g} s, but the clouds come every "
-            f"{period_s:.3g} s, so these times are not used; correct the driver"
-        )
-    elif not is_timed:
-        notes.append(f"{where}: the points have no times, or all the same; let the driver publish them")
+    is_timed = any(len(cloud.times_s) for cloud in first)
     if not is_timed:
         turns = [
             turn_of((cloud.points @ mounting.rotation.T)[:, :2], np.linspace(0.0, 1.0, len(cloud.points)))
@@ -93,11 +87,8 @@ def reader_of(first: Sequence[PointCloud], mounting: CloudMounting, where: str) 
         ]
         if sum(turn is not None for turn in turns) * 2 <= len(turns):
             period_s = 0.0
-        notes[-1] += (
-            "; the order of the points gives their times"
-            if period_s
-            else "; the motion during a turn is not corrected, so drive slowly"
-        )
+        order = "their order gives them" if period_s else "the motion during a turn is not corrected, so drive slowly"
+        notes.append(f"{where}: the points have no times; {order}")
     if not mounting.is_height_known:
         mounting = _on_floor(first, mounting) or mounting._replace(is_height_known=True)
     flipped = mounting._replace(rotation=np.diag([1.0, -1.0, -1.0]) @ mounting.rotation)
@@ -114,7 +105,7 @@ def reader_of(first: Sequence[PointCloud], mounting: CloudMounting, where: str) 
             f"{where}: no floor is seen where the mounting has it, so maps are levelled by the IMU, or else as the "
             "LiDAR is mounted; check its pose in tf"
         )
-    return CloudReader(mounting, is_timed, period_s), tuple(notes)
+    return CloudReader(mounting, is_timed, period_s, band.body_radius_m), tuple(notes)
 
 
 def _elevations(cloud: PointCloud) -> float:

@@ -78,7 +78,7 @@ class CloudBag:
         first = list(islice(valid(messages, plan.scans.cloud), FIRST_MESSAGES))
         if not first:
             raise SourceError(f"{where}: no cloud can be read; correct the driver, or copy the bag again")
-        return reader_of(first, plan.scans.mounting(self._topic, first[0].frame), where)
+        return reader_of(first, plan.scans.mounting(self._topic, first[0].frame), self._bag.options.cloud_band, where)
 
     def survey(self, scans: ScanRange = WHOLE) -> Survey:
         """As in Source; clouds are counted, and not decoded."""
