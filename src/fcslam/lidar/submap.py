@@ -215,7 +215,7 @@ def agreement(query: Submap, target: Submap, T_target_query: FloatArray) -> Agre
     known, explained, violating, tensor = _agreement(
         query.surface.points,
         query.surface.normals,
-        T_target_query,
+        np.array(T_target_query),  # a writable copy: code is compiled once
         target.field.arrays,
         target.free,
         target.free_corner,
