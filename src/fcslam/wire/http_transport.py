@@ -278,7 +278,10 @@ def _check_url(url: str, shown: Credentials) -> None:
     except ValueError:  # the port, or a bracket of IPv6
         is_address = False
     if not is_address or not parts.hostname:
-        raise CloudError(f"{url!r} is not the address of a cloud; give one like https://cloud.example:8443")
+        raise CloudError(
+            f"{url!r} is not the address of a cloud; give one like https://cloud.example:8443, "
+            "on this machine http://127.0.0.1:8340"
+        )
     if shown.token and parts.scheme == "http" and not is_loopback(parts.hostname):
         raise CloudError(f"{url}: a token would be sent unencrypted; use https")
     if shown.own and parts.scheme == "http":
