@@ -11,7 +11,7 @@ from fcslam.geometry import se2
 from fcslam.geometry.groups import group_of
 from fcslam.graph.cluster import local_frames, relative_frame
 from fcslam.graph.consistency import Closures
-from fcslam.graph.evidence import LEAD, MapFit, refutation
+from fcslam.graph.evidence import LARGEST_CONTRADICTION, LEAD, MapFit, refutation
 from fcslam.graph.trajectory import Trajectory
 from fcslam.lidar.map_agreement import PlaceAgreement
 from fcslam.places.local_maps import LocalMaps, SeenKeyscans
@@ -128,8 +128,9 @@ class MapComparison(Kept):
             found_elsewhere = alignments(whole_a, whole_b, best.T_a_b, parallel_headings(whole_a, whole_b))
             for rival in (each for each in found_elsewhere[:RIVALS] if each.score_m > 0.0):
                 T = se2.compose(se2.compose(T_a_i, rival.T_a_b), se2.inverse(T_b_j))
-                found = local_maps.agreement(np.broadcast_to(T, b.poses.shape))
-                if found.support > fit.rival_support and refutation(_fit(found)) is None:
+                # Two places that look alike may both fit badly; the better one is more likely.
+                found = _fit(local_maps.agreement(np.broadcast_to(T, b.poses.shape)))
+                if found.support > fit.rival_support and found.contradiction <= LARGEST_CONTRADICTION:
                     fit = replace(fit, rival_support=found.support)
         return _Compared(i, j, frozen(T_i_j), keyscans, len(members), len(a) + len(b), fit)
 
