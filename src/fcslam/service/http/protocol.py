@@ -134,7 +134,7 @@ class GuardedProtocol(H11Protocol):
     """
 
     _read: ClassVar = TokenBuckets(time.monotonic, 16.0 * 2**20, 4.0 * 2**20)
-    """Bytes that are read of one token, or of all connections whose token is not known yet."""
+    """Bytes that are read of one token, or of all connections without one."""
     _stuck_since: float | None = None
     """When the client stopped to read what is sent; None: it reads."""
     _idle_since = 0.0
@@ -159,10 +159,10 @@ class GuardedProtocol(H11Protocol):
     def data_received(self, data: bytes) -> None:
         """Take a part of a request; if its sender has sent more than others may, its next parts wait in the network."""
         super().data_received(data)
-        who = self._state.get(WHO)
-        wait_s = self._read.wait_s(
-            "" if who is None else who.name, len(data) + 2**14
-        )  # each part takes time, also a small one
+        if WHO not in self._state:  # the first part, or nobody asks for tokens
+            return
+        name = getattr(self._state[WHO], "name", "")
+        wait_s = self._read.wait_s(name, len(data) + 2**14)  # each part takes time, also a small one
         if wait_s > 0.0 and not self.transport.is_closing():
             self.transport.pause_reading()
             self.loop.call_later(wait_s, self._read_on)
