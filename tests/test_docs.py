@@ -145,7 +145,7 @@ def test_every_make_target_exists(page):
 
 @pages
 def test_every_setting_exists(page):
-    files = {"map.png", "map.pgm", "map.yaml"}
+    files = {"map.png", "map.ply", "map.pgm", "map.yaml"}
     named = set(SETTING.findall(page.read_text(encoding="utf-8"))) - files
     assert [key for key in sorted(named) if not is_setting(key)] == []
 

@@ -1,5 +1,7 @@
 """A fleet in space: robots with 3D LiDARs, robots with 2D LiDARs, and both in one map."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,9 +11,11 @@ from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import PacketError
 from fcslam.geometry import se2, se3
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.mission.mission import MissionConfig, run_mission
-from fcslam.records import ClosureStatus, ReasonCode
+from fcslam.mission.mission import MissionConfig, MissionInputs, run_mission
+from fcslam.mission.mission_file import read_mission
+from fcslam.records import ClosureStatus, ReasonCode, VoxelMap
 from fcslam.runs import open_run
+from fcslam.wire.packets import encode
 from tests.cloud.space_fleet import BASE_M, in_space, leaning, planar
 from tests.flats import BACK, ROUND, Drive, flat
 from tests.small_fleet import feed, fingerprint, in_order, map_of
@@ -150,3 +154,25 @@ def test_a_run_in_space_keeps_its_six_degrees_of_freedom(tmp_path):
     assert run.pose_graph_g2o.startswith("VERTEX_SE3:QUAT 0 ")
     assert {"map.pgm", "map.yaml", "map.png"} <= run.map_files.keys()
     assert "map.ply" not in run.map_files, "no robot sent a voxel map"
+    again = run_mission([], MissionConfig(fleet=SPACE), inputs=MissionInputs(read_mission(tmp_path / "run")))
+    for name, trajectory in run.trajectories.items():
+        assert again.trajectories[name].T_map_base_6d.tobytes() == trajectory.T_map_base_6d.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"T_base_ground": se3.from_plane((11.0, 0.0, 0.0))}, "floor 11 m off the base, at most 10 m"),
+        ({"last": 4000}, "is of 4001 keyscans, at most 2000"),
+        ({"last": 1900}, "names keyscan 1900"),
+        ({}, "has a voxel map already"),
+    ],
+)
+def test_a_voxel_map_beyond_a_limit_is_refused(change, reason):
+    packets = [packet for packet in sent("a") if packet.robot == "a"]
+    number = next(n for n, packet in enumerate(packets) if isinstance(packet.body, VoxelMap))
+    cloud, known = Cloud(SPACE, 0), packets[: number + (not change)]
+    feed(cloud, known)
+    told = replace(packets[number], sequence=len(known), body=replace(packets[number].body, **change))
+    with pytest.raises(PacketError, match=reason):
+        cloud.receive(encode(told))

@@ -8,10 +8,10 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.errors import PacketError
-from fcslam.geometry.groups import SE2, group_of
+from fcslam.geometry.groups import SE2, SE3, group_of
 from fcslam.lidar.frontend import least_sigmas
 from fcslam.lidar.verification import CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
-from fcslam.records import Constraint, ConstraintKind, FloatArray, Place, TagSighting, frozen
+from fcslam.records import Constraint, ConstraintKind, FloatArray, Place, TagSighting, VoxelMap, frozen
 
 _ROUNDING = 1.01
 """Information is sent in single precision, and standard deviations are compared by its diagonal."""
@@ -23,6 +23,8 @@ WIDEST_SUBMAP_M = 2.0 * LONGEST_CLOSURE_M
 """Largest distance of a keyscan from the anchor of its submap, metres."""
 MOST_SUBMAP_KEYSCANS = 2000
 """Largest number of keyscans in a submap."""
+HIGHEST_BASE_M = 10.0
+"""Largest distance of a base from the floor below it, metres."""
 FARTHEST_TAG_M = LONGEST_CLOSURE_M
 """Largest distance at which a camera reads a tag, metres."""
 LEAST_SIGMA_M = 0.001
@@ -110,6 +112,15 @@ def check_sighting(sighting: TagSighting) -> None:
     if not distance_m <= FARTHEST_TAG_M:
         name = f"{sighting.id.robot}: tag {sighting.tag}"
         raise PacketError(f"{name} is {distance_m:.4g} m away, at most {FARTHEST_TAG_M:g} m")
+
+
+def check_voxel_map(voxels: VoxelMap) -> None:
+    """Check where the floor below a robot is, and over how many keyscans a voxel map reaches."""
+    name, below_m = f"{voxels.id.robot}: voxel map {voxels.id.number}", float(SE3.shift_m(voxels.T_base_ground))
+    if not below_m <= HIGHEST_BASE_M:
+        raise PacketError(f"{name} has its floor {below_m:.4g} m off the base, at most {HIGHEST_BASE_M:g} m")
+    if voxels.last - voxels.first >= MOST_SUBMAP_KEYSCANS:
+        raise PacketError(f"{name} is of {voxels.last - voxels.first + 1} keyscans, at most {MOST_SUBMAP_KEYSCANS}")
 
 
 def check_submap(place: Place, poses: FloatArray) -> None:

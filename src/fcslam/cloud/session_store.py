@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from fcslam.cloud.claims import LONGEST_MOTION_M, ClaimLimits, check_constraint, check_distance
+from fcslam.cloud.claims import LONGEST_MOTION_M, ClaimLimits, check_constraint, check_distance, check_voxel_map
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.sessions import in_session
 from fcslam.errors import PacketError
@@ -172,6 +172,7 @@ class SessionStore:
 
     def add_voxel_map(self, voxels: VoxelMap, sequence: int) -> None:
         """The surfaces around a keyscan; ``sequence`` is the number of its packet."""
+        check_voxel_map(voxels)
         robot, number = voxels.id
         self.require(voxels.id, KeyscanId(robot, voxels.last))
         if number in self._sessions[robot].voxel_maps:

@@ -24,8 +24,8 @@ _STEP_M, _STEP_RAD = 0.005, 0.003
 _SLOPE: Final = 0.02
 _NEAR_M, _NEAR_RAD = 0.6, 0.15
 """Farthest that the alignment of two voxel maps may be from where walls in the plane put them."""
-_KEPT: Final = 200
-"""Voxel maps that are kept ready to compare, 2 MB each."""
+_KEPT: Final = 60
+"""Voxel maps that are kept ready to compare, 3 MB each."""
 
 
 class Space:

@@ -20,6 +20,7 @@ from fcslam.cloud.sessions import robot_and_epoch, robot_of, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import one_line
 from fcslam.errors import InputError, PacketConflictError, StoreError
+from fcslam.geometry.groups import SE2, SE3
 from fcslam.records import Change, Channel, Constraint, Correction, Edit, Keyscan, ManualClosure, Removal, Undo, frozen
 from fcslam.storage.database import Database, check_file, translate_errors
 from fcslam.storage.row_store import RowStore, StoreTable, Transaction, change_rows
@@ -533,10 +534,11 @@ def _found(
 
 
 def _track(stamps: bytes, keyscans: bytes, offsets: bytes) -> Track:
+    size = SE3.size if len(offsets) == SE3.size * len(stamps) > 0 else SE2.size
     track = Track(
         frozen(np.frombuffer(stamps, "<f8")),
         np.frombuffer(keyscans, "<i8"),
-        frozen(np.frombuffer(offsets, "<f8").reshape(-1, 3)),
+        frozen(np.frombuffer(offsets, "<f8").reshape(-1, size)),
     )
     if not len(track.stamps) == len(track.keyscans) == len(track.T_keyscan_base):
         raise ValueError("its columns have different lengths")
@@ -544,6 +546,8 @@ def _track(stamps: bytes, keyscans: bytes, offsets: bytes) -> Track:
         raise ValueError("a number is not finite")
     if len(track.keyscans) and (track.keyscans.min() < 0):
         raise ValueError("a keyscan has a negative number")
+    if size == SE3.size and not np.allclose(np.linalg.norm(track.T_keyscan_base[:, 3:], axis=1), 1.0):
+        raise ValueError("a quaternion is not one")
     return track
 
 
