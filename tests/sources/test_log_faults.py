@@ -34,10 +34,7 @@ def written(path: Path, content: bytes) -> Path:
         (b"\x1f\x8b\x08\x00garbage", "truncated or damaged"),
         (b"\xfd7zXZ\x00garbage", "truncated or damaged"),
         (b"BZh9garbage", "cannot be read"),
-        (b"PK\x03\x04" + bytes(60), "is a zip archive; unpack it"),
-        (b"run/".ljust(257, b"\0") + b"ustar" + bytes(250), "is a tar archive; unpack it"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n", "is a pointer of Git LFS"),
-        (b"<!DOCTYPE html><html><body>Sign in</body></html>\n", "is a web page"),
     ],
 )
 def test_what_is_no_recording_is_refused(tmp_path, content, reason):

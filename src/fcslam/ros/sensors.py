@@ -165,7 +165,6 @@ class LiveSensors:
     def _fix(self, topic: str, payload: bytes, received_ns: int) -> Iterator[GnssFix]:
         if self._plan is None:
             return
-        fix: GnssFix | Fault
         try:
             fix = fix_of(self._codec.decode(payload, FIX), received_ns, self.planner.tree, self.planner.base_frame)
         except ValueError:

@@ -60,7 +60,6 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
             KnownTopics(inside, tuple(transforms), "", every, place, "start the driver"),
             wanted,
             field_of_view_rad=lambda _: 0.0,
-            has_images=lambda _: True,
             jumps=lambda topic: "global" in topic.name or "map" in topic.name,
         )
     except SourceError as error:

@@ -23,16 +23,11 @@ if TYPE_CHECKING:
     from fcslam.sources.bags.rosbag import RosBag
 
 LOG, BAG = "CARMEN log", "ROS bag"
-_OTHERS: tuple[tuple[int, bytes, str], ...] = (
-    (0, b"PK\x03\x04", "is a zip archive; unpack it and give the recording in it"),
-    (0, b"7z\xbc\xaf\x27\x1c", "is a 7z archive; unpack it and give the recording in it"),
-    (257, b"ustar", "is a tar archive; unpack it by `tar -xf` and give the recording in it"),
-    (0, b"version https://git-lfs", "is a pointer of Git LFS and not the recording; fetch that by `git lfs pull`"),
-    (0, b"/annex/objects/", "is a pointer of git-annex and not the recording; fetch that by `git annex get`"),
-    (0, b"<!DOCTYPE", "is a web page and not the recording; download that again"),
-    (0, b"<html", "is a web page and not the recording; download that again"),
+_OTHERS: tuple[tuple[bytes, str], ...] = (
+    (b"version https://git-lfs", "is a pointer of Git LFS and not the recording; fetch that by `git lfs pull`"),
+    (b"/annex/objects/", "is a pointer of git-annex and not the recording; fetch that by `git annex get`"),
 )
-"""Where other files have which bytes, and what they are and what to do."""
+"""How other files begin, and what they are and what to do."""
 _FEW_BYTES = 512
 _SCANS_SHARED = 20
 """Scans that two recordings share at least if they overlap."""
@@ -164,8 +159,8 @@ def format_of(path: Path) -> str:
 
 
 def _refuse_others(path: Path, content: bytes) -> None:
-    for at, magic, what in _OTHERS:
-        if content.startswith(magic, at):
+    for magic, what in _OTHERS:
+        if content.startswith(magic):
             raise SourceError(f"{path}: {what}")
     if not content:
         for file in filter(Path.is_file, (*path.glob("*.mcap"), *path.glob("*.db3"))):

@@ -102,13 +102,12 @@ def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
 
 def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -> Inspection:
     survey = source.survey()
-    stamps: list[float] = []
     by_laser: list[tuple[LaserModel, list[float]]] = [(laser, []) for laser in survey.lasers]
-    odometry = images = 0
+    scans = odometry = images = 0
     for record in source.records():
         match record:
             case LaserScan():
-                stamps.append(record.stamp)
+                scans += 1
                 for laser, own in by_laser:
                     if is_same_laser(record.laser, laser):
                         own.append(record.stamp)
@@ -124,7 +123,7 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
         name,
         bag,
         source.name,
-        len(stamps),
+        scans,
         survey.duration_s,
         survey.path_length_m,
         tuple(LaserContents(laser, len(own), _rate_hz(own)) for laser, own in by_laser),

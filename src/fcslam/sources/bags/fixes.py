@@ -18,8 +18,6 @@ NO_FIX: Final = -1
 """STATUS_NO_FIX; below, the status is unknown, as in messages that nobody set it in."""
 FIX_INTERVAL_S: Final = 0.9
 """Least time between two fixes that are used; the errors of nearer ones are the same."""
-HIGHEST_M: Final = 1e5
-"""A larger altitude is unknown."""
 LARGEST_SIGMA_M: Final = 1e4
 FARTHEST_ANTENNA_M: Final = 50.0
 """Largest distance of the antenna from the robot's base."""
@@ -54,7 +52,7 @@ def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str)
         stamp,
         latitude,
         longitude,
-        altitude if abs(altitude) <= HIGHEST_M else 0.0,
+        altitude if math.isfinite(altitude) else 0.0,
         sigma_m,
         _antenna(tree, base_frame, frame),
     )

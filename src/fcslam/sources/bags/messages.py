@@ -16,8 +16,6 @@ UNKNOWN_RANGE_M = 1000.0
 """Taken as the maximum of a laser that states none: 0, below 0 or not a number; and of one that states more."""
 SHORTEST_SWEEP_S, LONGEST_SWEEP_S = 1e-4, 1.0
 """A scan that takes less is one at once; no scanner takes longer for a turn, so a larger time increment is wrong."""
-_OVER_SCAN_TIME = 1.2
-"""Largest ratio of the time of all beams to the time between scans; some drivers state a wrong time increment."""
 LONGEST_NAME = 255
 """Characters in the name of a topic or a frame, as in ROS 2."""
 
@@ -75,7 +73,7 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
     range_max_m = min(range_max_m, UNKNOWN_RANGE_M) if range_max_m > 0.0 else UNKNOWN_RANGE_M
     if not range_max_m > range_min_m:
         raise ValueError(f"range_min {range_min_m:g} is not below range_max {range_max_m:g}")
-    sweep = _sweep(count, float(content.time_increment), float(content.scan_time))
+    sweep = _sweep(count, float(content.time_increment))
     if increment_rad < 0.0:
         first_rad, increment_rad, ranges = first_rad + span_rad, -increment_rad, ranges[::-1]
         sweep = reversed_sweep(sweep)
@@ -86,14 +84,10 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
     return ScanMessage(stamp, frame, beams, range_min_m, range_max_m, ranges, sweep=sweep)
 
 
-def _sweep(count: int, increment_s: float, scan_time_s: float) -> Sweep | None:
+def _sweep(count: int, increment_s: float) -> Sweep | None:
     """Times of the beams of a message: the stamp is the time of the first, as ``LaserScan.msg`` says."""
     last_s = (count - 1) * increment_s
-    if not SHORTEST_SWEEP_S <= last_s <= LONGEST_SWEEP_S:  # false for NaN
-        return None
-    if scan_time_s > 0.0 and count * increment_s > _OVER_SCAN_TIME * scan_time_s:
-        last_s = scan_time_s * (count - 1) / count
-    return Sweep(0.0, last_s)
+    return Sweep(0.0, last_s) if SHORTEST_SWEEP_S <= last_s <= LONGEST_SWEEP_S else None  # NaN is in no interval
 
 
 def reversed_sweep(sweep: Sweep | None) -> Sweep | None:
@@ -173,8 +167,7 @@ def header_of(header: Any, bag_time_ns: int) -> tuple[float, str]:
 
 def stamp_ns_of(header: Any) -> int:
     """The stamp of a header."""
-    stamp_ns: int = header.stamp.sec * NANOSECONDS + header.stamp.nanosec
-    return stamp_ns
+    return int(header.stamp.sec * NANOSECONDS + header.stamp.nanosec)
 
 
 def frame_of(name: str) -> str:

@@ -29,7 +29,6 @@ from fcslam.sources.gate import FIRST_MESSAGES, MAX_STEP_BACK_S
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
 from fcslam.sources.point_clouds import CloudBand
 
-_IMAGES_TRIED = 5
 _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
 _FEWEST_LAGS = 4
@@ -114,7 +113,7 @@ class _Planner:
     def __init__(self, robot: BagRobot, options: BagOptions) -> None:
         self._robot, self._options, self._bag, self._path = robot, options, robot.bag, robot.bag.path
         known = KnownTopics(robot.topics, robot.transforms, f"{robot.bag.path}: ")
-        self._topics = choose_topics(known, options, self._view_rad, self._has_images, self._jumps)
+        self._topics = choose_topics(known, options, self._view_rad, self._jumps)
         self._tree = robot.bag.tree(robot.transforms)
         self._scans = BagScans(robot, self._topics.scans, options, self._tree, self._base_frame_of)
         self._notes: list[str] = []
@@ -168,7 +167,8 @@ class _Planner:
         if self._options.odom_topic == NO_ODOMETRY:
             return None
         for candidate in self._odometry_candidates(frame):
-            error = "" if candidate.edge is not None else self._odometry_error(candidate.topics[0])
+            its = self._bag.census[candidate.topics[0]]
+            error = its.error if candidate.edge is None and its.broken == its.count else ""
             readings = chain.from_iterable(valid(self._bag.read(candidate.topics), candidate.readings))
             fault = f"cannot be read ({error})" if error else fault_of_odometry(each.T_odom_base for each in readings)
             if fault is None or not (error or self._scans_change()):
@@ -264,20 +264,8 @@ class _Planner:
         frames = self._bag.census[topic].odom_frames
         return bool(frames) and all(map(is_corrected, frames))
 
-    def _has_images(self, topic: Topic) -> bool:
-        images = valid(
-            islice(self._bag.read([topic]), _IMAGES_TRIED),
-            lambda message: image_of(message.content, topic.type, message.unstamped_ns),
-        )
-        return next(images, None) is not None
-
     def _view_rad(self, topic: Topic) -> float:
         if topic.type not in LASER_SCANS:
             return tau
         scan = next(valid(self._bag.read([topic]), lambda message: message.content), None)
         return 0.0 if scan is None else scan.beams.span_rad
-
-    def _odometry_error(self, topic: Topic) -> str:
-        first = [message.decoded for message in islice(self._bag.read([topic]), FIRST_MESSAGES)]
-        is_bad = topic.type == ODOMETRY and first and all(isinstance(each, ValueError) for each in first)
-        return str(first[0]) if is_bad else ""

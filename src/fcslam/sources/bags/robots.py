@@ -166,15 +166,10 @@ def _members(heard: Sequence[Topic], bag: DecodedBag) -> tuple[list[_Member], se
 
 def _spaces(scans: Sequence[Topic], marks: Sequence[Topic]) -> dict[Topic, str]:
     """The namespace of each topic of scans: the innermost one around it with any of the odometry and tf ``marks``."""
-    space_of = {
+    return {
         topic: next((space for space in _namespaces(topic) if any(space in _namespaces(mark) for mark in marks)), "")
         for topic in scans
     }
-    for space in sorted(set(space_of.values())):  # one whose marks are all of the only robot inside is this robot
-        inside = sorted({each for each in space_of.values() if each.startswith(f"{space}/")})
-        if len(inside) == 1 and not any(_innermost(mark, {space, *inside}) == space for mark in marks):
-            space_of = {topic: inside[0] if each == space else each for topic, each in space_of.items()}
-    return space_of
 
 
 def _only_robot(bag: DecodedBag, members: Sequence[_Member], options: BagOptions) -> BagRobot:

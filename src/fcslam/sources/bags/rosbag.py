@@ -160,7 +160,6 @@ class RosBag:
     def _fixes(self) -> tuple[tuple[GnssFix, ...], Faults]:
         audit, found = _audit(), list[GnssFix]()
         for message in self.bag.read(fix_topics(self.robot)[:1]):
-            fix: GnssFix | Fault
             try:
                 fix = fix_of(message.content, message.unstamped_ns, self.plan.tree, self._reading.base_frame)
             except ValueError:

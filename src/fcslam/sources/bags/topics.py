@@ -72,7 +72,6 @@ def choose_topics(
     known: KnownTopics,
     options: BagOptions,
     field_of_view_rad: Callable[[Topic], float],
-    has_images: Callable[[Topic], bool],
     jumps: Callable[[Topic], bool],
 ) -> Topics:
     """Choose the topics of a robot to read, by these rules in order:
@@ -104,7 +103,7 @@ def choose_topics(
         odometries = []
     elif options.odom_topic is not None:
         odometries = [_named(known, options.odom_topic, "--sensors odom-topic")]
-    camera, camera_info, notes = _choose_camera(known, options.camera_topic, has_images)
+    camera, camera_info, notes = _choose_camera(known, options.camera_topic)
     if not options.scan_topics:
         notes = [*_note(known, "laser scans", "--sensors scan-topic", lasers[0], scans), *notes]
     if measured := [topic for topic in odometries if topic.type == ODOMETRY]:
@@ -146,17 +145,10 @@ def _best_scan(scans: Sequence[Topic], field_of_view_rad: Callable[[Topic], floa
     )
 
 
-def _choose_camera(
-    known: KnownTopics, wanted: str | None, has_images: Callable[[Topic], bool]
-) -> tuple[Topic | None, Topic | None, list[str]]:
-    images = _images(known)
-    if wanted is not None:
-        images = [_named(known, wanted, "--sensors camera-topic")]
-    cameras = list(filter(has_images, images))
+def _choose_camera(known: KnownTopics, wanted: str | None) -> tuple[Topic | None, Topic | None, list[str]]:
+    cameras = _images(known) if wanted is None else [_named(known, wanted, "--sensors camera-topic")]
     if not cameras:
-        names = ", ".join(topic.name for topic in images)
-        note = f"{known.label}no images of {names} can be read, the camera is left out"
-        return None, None, [note] * bool(images)
+        return None, None, []
     info_of = {camera: _calibration_of(camera, known) for camera in cameras}
     chosen = min(
         cameras,

@@ -13,7 +13,6 @@ from fcslam.geometry import se3
 from fcslam.records import FloatArray, Transform
 from fcslam.sources.pose import Pose
 
-Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 """Unit quaternion (x, y, z, w)."""
 
@@ -49,7 +48,7 @@ _NO_ODOMETRY = ("map", *USUAL_BASES)
 IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
-def transform_of(translation_m: Vector, rotation: Quaternion) -> Transform:
+def transform_of(translation_m: tuple[float, float, float], rotation: Quaternion) -> Transform:
     """Check a transform and normalise its quaternion; raises ValueError if it is invalid."""
     x, y, z, w = rotation
     length = sqrt(x * x + y * y + z * z + w * w)
@@ -96,9 +95,9 @@ class TransformTree:
         if (parent, child) not in self.links:
             self._parents.setdefault(child, []).append(parent)
         of_link = self.links.setdefault((parent, child), T_parent_child)
-        differs = 0 if of_link is None else difference(of_link, T_parent_child)
-        if of_link is not None and differs:
-            self.links[parent, child] = None if differs > 1 else _levelled(of_link)
+        if of_link is not None and (differs := difference(of_link, T_parent_child)):
+            level = of_link._replace(rotation=in_space(np.array(planar(of_link))).rotation)
+            self.links[parent, child] = level if differs == 1 else None
 
     def __contains__(self, frame: str) -> bool:
         return frame in self._parents or any(parent == frame for parent, _ in self.links)
@@ -218,8 +217,3 @@ def difference(first: Transform, second: Transform) -> int:
     is_same = max(abs(x - other_x), abs(y - other_y)) <= _STILL and cos(heading_rad - other_rad) > cos(2.0 * _STILL)
     is_upright = all(each.rotation_matrix()[2, 2] > cos(_LARGEST_SWAY_RAD) for each in (first, second))
     return 1 if is_same and is_upright else 2
-
-
-def _levelled(transform: Transform) -> Transform:
-    x, y, z = transform.translation_m
-    return Transform((x, y, z), in_space(np.array(planar(transform))).rotation)
