@@ -10,9 +10,9 @@ from fcslam.geometry import se3
 from fcslam.records import FloatArray, VoxelMap
 
 _CELL_M: Final = 0.1
-_NORMAL_M: Final = 0.35
-"""Points so near give the direction of a surface."""
-_FEWEST: Final = 4
+_NEIGHBOURS: Final = 12
+"""Points that give the direction of a surface."""
+_AT_ONCE: Final = 50_000
 _COLOURS: Final = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], np.float64)
 """From low to high: five colours of the map viridis."""
 
@@ -37,36 +37,34 @@ end_header
 def joint_points(maps: Sequence[tuple[VoxelMap, FloatArray]]) -> tuple[FloatArray, FloatArray]:
     """Points (N, 3) and normals (N, 3) of voxel maps, given with ``T_map_base`` (7,) of their keyscans.
 
-    Each voxel of the joint map has the middle of its points. Normals face the scanner that was nearest.
+    Each voxel of the joint map has the middle of its points. Normals face the scanner.
     """
-    T_map_ground = np.array([se3.compose(pose, voxels.T_base_ground) for voxels, pose in maps])
-    points = np.concatenate([se3.transform(T, v.points_m) for T, (v, _) in zip(T_map_ground, maps, strict=True)])
-    origins = np.concatenate([se3.transform(T, v.origins_m) for T, (v, _) in zip(T_map_ground, maps, strict=True)])
+    T_map_ground = [se3.compose(pose, voxels.T_base_ground) for voxels, pose in maps]
+    placed = list(zip(T_map_ground, (voxels for voxels, _ in maps), strict=True))
+    points = np.concatenate([se3.transform(T, voxels.points_m) for T, voxels in placed])
+    origins = np.concatenate([se3.transform(T, voxels.origins_m)[voxels.seen_from] for T, voxels in placed])
     cells = np.floor(points / _CELL_M).astype(np.int64)
     _, number, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    middles = np.column_stack([np.bincount(number.ravel(), axis) for axis in points.T]) / counts[:, None]
-    return middles, _normals(middles, origins)
+    number = number.ravel()
+    middles = np.column_stack([np.bincount(number, axis) for axis in points.T]) / counts[:, None]
+    scanner = np.zeros_like(middles)
+    scanner[number] = origins
+    return middles, _normals(middles, scanner)
 
 
-def _normals(points: FloatArray, origins: FloatArray) -> FloatArray:
-    """The direction in which the points around each one spread least; zero where there are too few."""
+def _normals(points: FloatArray, scanner: FloatArray) -> FloatArray:
+    """The direction in which the neighbours of each point spread least, towards the scanner that saw it."""
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(points)
-    pairs = tree.query_pairs(_NORMAL_M, output_type="ndarray")
-    i, j = np.concatenate((pairs, pairs[:, ::-1])).T
-    count = np.bincount(i, minlength=len(points))
-    offset = points[j] - points[i]
-    mean = np.column_stack([np.bincount(i, axis, len(points)) for axis in offset.T]) / np.maximum(count, 1)[:, None]
-    spread = np.empty((len(points), 3, 3))
-    for r in range(3):
-        for c in range(3):
-            spread[:, r, c] = np.bincount(i, offset[:, r] * offset[:, c], len(points)) / np.maximum(count, 1)
-    spread -= mean[:, :, None] * mean[:, None, :]
-    normals = np.linalg.eigh(spread)[1][:, :, 0]
-    towards = origins[cKDTree(origins).query(points)[1]] - points
-    facing = np.where((normals * towards).sum(axis=1) < 0.0, -1.0, 1.0)
-    return np.asarray(normals * (facing * (count >= _FEWEST))[:, None], np.float64)
+    tree, count = cKDTree(points), min(_NEIGHBOURS, len(points))
+    normals = np.zeros_like(points)
+    for start in range(0, len(points), _AT_ONCE):  # the neighbours of all points of a large building are gigabytes
+        part = slice(start, start + _AT_ONCE)
+        around = points[tree.query(points[part], count)[1].reshape(-1, count)]
+        around -= around.mean(axis=1, keepdims=True)
+        normals[part] = np.linalg.eigh(np.einsum("nka,nkb->nab", around, around))[1][:, :, 0]
+    facing = np.where((normals * (scanner - points)).sum(axis=1) < 0.0, -1.0, 1.0)
+    return np.asarray(normals * facing[:, None], np.float64)
 
 
 def ply_of(maps: Sequence[tuple[VoxelMap, FloatArray]]) -> bytes:
