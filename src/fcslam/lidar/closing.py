@@ -122,11 +122,9 @@ class LoopCloser:
         """Number of the anchor of each submap so far."""
         self._travel = np.empty(0)
         """Path length up to each of them, metres (turns count a little)."""
-        self._held: dict[int, bytes | None] = {}
-        """The submaps that others are compared with, by index, None if not packed yet; the oldest of a well-known area
-        are forgotten."""
-        self._unpacked: dict[int, Submap] = {}
-        """Those used last, in this order."""
+        self._held: dict[int, Submap | bytes] = {}
+        """The submaps that others are compared with, by index, in the order of their use; all but the last are packed.
+        The oldest of a well-known area are forgotten."""
         self._accepted: list[tuple[int, int]] = []
         """Earlier and later submap of each accepted closure."""
         self._pending: list[LocalClosure] = []
@@ -145,8 +143,10 @@ class LoopCloser:
         later = len(self.keyscans)
         self.keyscans.append(keyscan)
         self._travel = np.append(self._travel, travel_m)
-        self._held[later] = None
-        self._keep_unpacked(later, submap)
+        self._held[later] = submap
+        for index in list(self._held)[:-UNPACKED]:
+            if isinstance(held := self._held[index], Submap):
+                self._held[index] = submap_bytes(held)
         is_known = self._forget_surplus(anchors)
         closures = np.array(self._accepted, dtype=np.int64).reshape(-1, 2)
         paths: FloatArray = _shortest_paths(later, np.diff(self._travel), closures, CLOSURE_PATH_M)
@@ -167,29 +167,16 @@ class LoopCloser:
         return self._accept(accepted, unsure, anchors)
 
     def _submap(self, index: int) -> Submap:
-        submap = self._unpacked.pop(index, None)
-        if submap is None:
-            packed = self._held[index]
-            assert packed is not None
-            submap = read_submap(packed)
-        self._keep_unpacked(index, submap)
+        held = self._held.pop(index)
+        self._held[index] = submap = read_submap(held) if isinstance(held, bytes) else held
         return submap
 
-    def _keep_unpacked(self, index: int, submap: Submap) -> None:
-        self._unpacked[index] = submap
-        if len(self._unpacked) > UNPACKED:
-            oldest = next(iter(self._unpacked))
-            submap = self._unpacked.pop(oldest)
-            if oldest in self._held and self._held[oldest] is None:
-                self._held[oldest] = submap_bytes(submap)
-
     def _forget_surplus(self, anchors: FloatArray) -> bool:
-        held = np.array(list(self._held))
+        held = np.sort(list(self._held))
         surplus = surplus_places(anchors[held, :2], NEARBY_M, MOST_NEARBY)
         for row in surplus:
             index = int(held[row])
             del self._held[index]
-            self._unpacked.pop(index, None)
             if self._recognizer is not None:
                 self._recognizer.forget(self.keyscans[index])
         return len(surplus) > 0
