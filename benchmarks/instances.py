@@ -357,6 +357,7 @@ def room(chosen: Any, place: Path, report: common.Report) -> None:
             if time.monotonic() > until:
                 sys.exit(f"{mission} has no worker, or an instance has no mission: {held}")
             time.sleep(0.1)
+        time.sleep(STEP_S)  # each instance prepares a worker for the next mission
         victim, began = held[mission], time.monotonic()
         fleet.processes[victim].kill()
         times += watch.fail_over(victim, [mission], began)

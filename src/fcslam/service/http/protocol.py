@@ -159,9 +159,9 @@ class GuardedProtocol(H11Protocol):
     def data_received(self, data: bytes) -> None:
         """Take a part of a request; if its sender has sent more than others may, its next parts wait in the network."""
         super().data_received(data)
-        if WHO not in self._state:  # the first part, or nobody asks for tokens
+        if self.cycle is not None and WHO not in self._state:  # nobody asks for tokens, or not yet
             return
-        name = getattr(self._state[WHO], "name", "")
+        name = getattr(self._state.get(WHO), "name", "")
         wait_s = self._read.wait_s(name, len(data) + 2**14)  # each part takes time, also a small one
         if wait_s > 0.0 and not self.transport.is_closing():
             self.transport.pause_reading()
