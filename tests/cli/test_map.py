@@ -232,7 +232,7 @@ def test_floors_are_those_of_all_recordings_or_of_one(options, floors):
     ("words", "reason"),
     [
         ("-c seed=-1", "--config: seed: Input should be greater than or equal to 0"),
-        ("-c fleet.join_map=false", "did you mean 'join_maps'?"),
+        ("-c fleet.join_map=false", "did you mean 'fleet.join_maps'?"),
         ("-c fleet.join_maps=[", "--config fleet.join_maps: not valid YAML"),
         ("-c seed", "seed: cannot read the configuration"),
         ("-c fleet.start_sigma=[0.3]", "fleet.start_sigma.1: Field required"),
