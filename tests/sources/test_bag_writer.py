@@ -184,6 +184,14 @@ def test_what_cannot_be_written_is_reported(tmp_path, name):
         write_bag(tmp_path / name, straight(2))
 
 
+def test_a_clock_that_begins_at_zero_reads_back_to_the_last_bit(tmp_path):
+    """The first stamp is zero, and the times of recording of equal stamps differ by a nanosecond."""
+    ranges_m, pose = frozen(np.ones(ROUND.beam_count), np.float32), frozen((0.0, 0.0, 0.0))
+    stamps = [0.125 * (k // 3) for k in range(30)]
+    write_bag(tmp_path / "run.mcap", [LaserScan(stamp, ranges_m, ROUND, pose) for stamp in stamps])
+    assert [scan.stamp for scan in scans_of(open_source(tmp_path / "run.mcap"))][3:] == stamps[3:]
+
+
 @pytest.mark.parametrize("stamp", [-1.0, 2.0**31, math.nan])
 def test_stamps_that_ros_does_not_have(tmp_path, stamp):
     one = frozen(np.ones(12), np.float32)

@@ -94,8 +94,8 @@ class TopicCensus:
 
     @cached_property
     def lag_ns(self) -> int:
-        """What the times of recording of messages without a stamp are less: the clock of the others counts."""
-        return round(NANOSECONDS * float(np.median(self.lags_s))) if self.unstamped and self.lags_s else 0
+        """Time of recording less the clock of the stamps that are set, for messages without one; whole milliseconds."""
+        return round(1e3 * float(np.median(self.lags_s))) * 10**6 if self.unstamped and self.lags_s else 0
 
     def _note_stamp(self, header: Any, now_ns: int) -> None:
         if stamp_ns := stamp_ns_of(header):
