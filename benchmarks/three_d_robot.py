@@ -1,0 +1,87 @@
+"""One robot with a 3D LiDAR: how exact is its trajectory with wheels, with an IMU, with both and with neither?
+
+    python benchmarks/three_d_robot.py /path/to/bags
+    python benchmarks/three_d_robot.py /path/to/bags --drives ramp-32 --sensors neither
+
+Bags are of a simulator outside of this repository: a corridor with rooms, furniture and a ceiling. Robots have 16 rings
+at 10 Hz, turns of up to 1.2 rad/s, wheels whose scale is off by 1.5 % and whose turns are off by 3 %, and an IMU with
+biases of 0.01 rad/s. `ramp-<seed>` goes up a ramp of 1.4 m between plain walls, `flat-<seed>` has no ramp. Beside each
+bag, `<bag>.truth.tum` has the true pose at each turn of the LiDAR.
+
+The trajectory is that of the robot alone, before any cloud. Errors are those of the positions after one rigid
+alignment, which rotations fix, too. The CPU time is that of a turn, with reading the bag; the uplink is that of all
+packets.
+"""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import common
+import numpy as np
+
+from fcslam.geometry import se3
+from fcslam.records import CloudScan
+from fcslam.robot.backend import SessionConfig
+from fcslam.robot.frontend3d import RobotFrontend3d
+from fcslam.runs.tables import read_tum_6d
+from fcslam.sources import BagOptions, open_fleet
+from fcslam.wire.packets import measure
+
+SENSORS = {"wheels, IMU": (True, True), "wheels": (True, False), "IMU": (False, True), "neither": (False, False)}
+DRIVES = "flat-7", "flat-202", "ramp-32", "ramp-101", "ramp-303", "ramp-404"
+COLUMNS = {"drive": "", "sensors": "", "turns": "", "sessions": "", "ATE (RMSE), m": ".4f", "in the plane, m": ".4f",
+           "max, m": ".3f", "rotation, deg": ".3f", "CPU, ms a turn": ".1f", "uplink, kB/s": ".1f"}  # fmt: skip
+
+
+def main() -> None:
+    parser = common.options(__doc__)
+    parser.add_argument("bags", type=Path, help="folder of the bags")
+    parser.add_argument("--drives", nargs="+", default=DRIVES)
+    parser.add_argument("--sensors", nargs="+", choices=SENSORS, default=tuple(SENSORS))
+    chosen = parser.parse_args()
+    rows = []
+    for drive in chosen.drives:
+        for sensors in chosen.sensors:
+            rows.append(row_of(chosen.bags / drive, sensors))
+            print(*rows[-1], flush=True)
+    report = common.Report(__file__, __doc__, chosen)
+    report.table("Drives", COLUMNS, rows)
+    report.write()
+
+
+def row_of(bag: Path, sensors: str) -> tuple:
+    has_wheels, has_imu = SENSORS[sensors]
+    [source] = open_fleet([(bag, "anna")], BagOptions(in_3d=True))
+    robot, packets = RobotFrontend3d("anna", SessionConfig()), []
+    began = time.process_time()
+    for scan in source.records():
+        assert isinstance(scan, CloudScan)
+        kept = replace(scan, wheels=scan.wheels[: None if has_wheels else 0], imu=scan.imu[: None if has_imu else 0])
+        packets += robot.process(kept)
+    packets += robot.finish()
+    cpu_s = time.process_time() - began
+    stamps, poses = read_tum_6d(Path(f"{bag}.truth.tum"))
+    track = max(robot.tracks, key=len)
+    true = poses[np.abs(stamps[:, None] - track.stamps).argmin(axis=0)]
+    uplink = sum(len(measure(packet).data) for packet in packets) / 1e3 / float(np.ptp(stamps))
+    errors = errors_of(track.T_odom_base(), true)
+    return bag.name, sensors, len(stamps), len(robot.tracks), *errors, 1e3 * cpu_s / len(stamps), uplink
+
+
+def errors_of(found: np.ndarray, true: np.ndarray) -> tuple[float, ...]:
+    """Root mean square of the position errors, of those in the plane, the largest one, and the mean angle."""
+    R_found, R_true = se3.rotation(found), se3.rotation(true)
+    moved, fixed = (poses[:, :3] - poses[:, :3].mean(axis=0) for poses in (found, true))
+    u, _, v = np.linalg.svd(fixed.T @ moved + np.einsum("nij,nkj->ik", R_true, R_found))
+    R = u @ np.diag((1.0, 1.0, np.linalg.det(u @ v))) @ v
+    off = moved @ R.T - fixed
+    error, in_plane = np.linalg.norm(off, axis=1), np.hypot(*off[:, :2].T)
+    cosine = (np.einsum("ij,njk,nik->n", R, R_found, R_true) - 1.0) / 2.0
+    angles = np.degrees(np.arccos(cosine.clip(-1.0, 1.0)))
+    rms = [float(np.sqrt((values**2).mean())) for values in (error, in_plane)]
+    return *rms, float(error.max()), float(angles.mean())
+
+
+if __name__ == "__main__":
+    main()
