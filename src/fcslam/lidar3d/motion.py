@@ -11,7 +11,7 @@ import numpy as np
 from fcslam.compiled import njit
 from fcslam.geometry import se2, se3
 from fcslam.lidar.gyro import FEWEST_READINGS, GYRO_NOISE, KEPT_S, GyroBias, covers, integral, newest
-from fcslam.lidar.odometry import WHEELS, OdometryTrust, odometry_error
+from fcslam.lidar.odometry import OdometryModel, OdometryTrust, odometry_error
 from fcslam.records import CloudScan, FloatArray
 
 _ACCELERATION: Final = np.array([1.0, 1.0, 1.0, 3.0, 3.0, 5.0])
@@ -19,6 +19,10 @@ _ACCELERATION: Final = np.array([1.0, 1.0, 1.0, 3.0, 3.0, 5.0])
 each."""
 _UNKNOWN: Final = np.array([1.0, 1.0, 0.3, 0.3, 0.3, 1.5])
 """The same of the velocity before anything is known about it, m/s and rad/s."""
+_WHEELS: Final = OdometryModel(
+    position_m=0.005, position_per_travel=0.1, position_per_turn_m=0.02, heading_rad=0.01, heading_per_turn=0.2
+)
+"""Model of the error of wheels during a turn of the LiDAR, a few centimetres of travel."""
 _TILT_RAD: Final = 0.03
 """Standard deviation of roll and pitch, which wheels do not measure; heights are as certain as positions."""
 _GYRO_RAD, _GYRO_SHARE = 1e-3, 0.01
@@ -75,7 +79,7 @@ class MotionSensors:
             moves = np.column_stack((steps[:, :2], np.zeros(len(steps))))
             turns = np.column_stack((np.zeros((len(steps), 2)), steps[:, 2]))
             moved_m = float(np.hypot(*planar[:2]))
-            error = self.trust.scale(odometry_error(moved_m, abs(planar[2]), WHEELS))
+            error = self.trust.scale(odometry_error(moved_m, abs(planar[2]), _WHEELS))
             sigma = np.array([*3 * [error.position_m], *2 * [_TILT_RAD], error.heading_rad])
         if covers(self._imu, times):
             turned = integral(self._imu[:, 0], self._imu[:, 1:4], times)
@@ -97,7 +101,7 @@ class MotionSensors:
         self.velocity, self._is_moving_known = tangent / length_s, True
         if predicted.planar is not None and is_fixed:
             planar = predicted.planar
-            error = odometry_error(float(np.hypot(*planar[:2])), abs(planar[2]), WHEELS)
+            error = odometry_error(float(np.hypot(*planar[:2])), abs(planar[2]), _WHEELS)
             found = se2.motion(np.array(self.trust.motion(planar)), se3.to_plane(motion))
             self.trust = self.trust.learn(found, error, planar)
         if predicted.rotation is not None:
