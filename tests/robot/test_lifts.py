@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.records import Channel, LaserModel, frozen
+from fcslam.lidar.lifts import Cabin
+from fcslam.records import Channel, LaserModel, LaserScan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
-from tests.lidar.worlds import box
-from tests.robot.lifting import errors_m, ride
+from tests.lidar.worlds import LASER, box, ranges
+from tests.robot.lifting import CABIN, DOOR, INSIDE, errors_m, ride
 
 pytestmark = pytest.mark.slow
 
@@ -74,3 +75,13 @@ def test_people_around_a_robot_are_no_cabin():
         near = frozen(np.minimum(scan.ranges_m, rng.uniform(0.8, 1.5, len(scan.ranges_m))), np.float32)
         crowd.append(replace(scan, ranges_m=near) if 200 <= number < 240 else scan)
     assert len(driven(crowd)) == 1
+
+
+@pytest.mark.parametrize(("speed_m_s", "rides"), [(0.0, True), (0.3, False)])
+def test_whoever_drives_through_a_small_room_rides_nowhere(speed_m_s, rides):
+    closed, opened = (ranges(np.array((*INSIDE, 0.0)), walls)[0] for walls in (np.vstack((CABIN, DOOR)), CABIN))
+    cabin = Cabin()
+    for k in range(26):
+        seen = frozen(closed if k < 25 else opened, np.float32)
+        cabin.add(LaserScan(0.2 * k, seen, LASER, frozen(np.array((0.2 * k * speed_m_s, 0.0, 0.0)))))
+    assert cabin.is_leaving == rides

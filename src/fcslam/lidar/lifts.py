@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from fcslam.lidar.lost import MOST_SCANS, SETTLED_M
-from fcslam.records import LaserScan
+from fcslam.records import FloatArray, LaserScan
 
 REACH_M: Final = 5.0
 """No more than ``OPEN`` of the beams of a scan within a cabin are longer."""
@@ -22,7 +22,9 @@ LEAST_SPAN_RAD: Final = math.radians(240.0)
 OPENED: Final = 1.15
 """The door opens as the robot sees more than the smallest area by this factor."""
 CLOSED_S: Final = 3.0
-"""Least time that the door is closed, seconds."""
+"""Least time that the robot stands behind the closed door, seconds."""
+STANDS_M: Final = 0.1
+"""A robot that moves by less stands; it may turn."""
 LEAVING_M: Final = SETTLED_M
 """Path after which the surroundings of the door are compared, metres."""
 LEAVING_SCANS: Final = 4 * MOST_SCANS
@@ -38,6 +40,11 @@ class Cabin:
         """Smallest area seen in the present cabin; infinity outside."""
         self.closed_s = math.inf
         """Stamp from which the present cabin is closed."""
+        self._stands_at: FloatArray | None = None
+        self._stands_s = math.inf
+        """Pose by odometry, shape (3,), around which the robot stands, and the stamp from which it does."""
+        self._rode = False
+        """Whether it stood there for ``CLOSED_S``: whoever drives through a small room rides nowhere."""
         self.is_leaving = False
         """Whether the door has opened, and the robot has not left the cabin behind."""
 
@@ -46,20 +53,23 @@ class Cabin:
         self._mounting = self._mounting or scan.laser.T_base_laser
         if scan.laser.T_base_laser != self._mounting:
             return
+        if self._stands_at is None or math.dist(self._stands_at[:2], scan.T_odom_base[:2]) > STANDS_M:
+            self._stands_at, self._stands_s = scan.T_odom_base, scan.stamp
         area_m2 = _seen_area_m2(scan)
         if area_m2 <= AREA_M2 and area_m2 <= OPENED * self._smallest_m2:
             if OPENED * area_m2 < self._smallest_m2:
                 self.closed_s = scan.stamp
             self._smallest_m2 = min(area_m2, self._smallest_m2)
+            self._rode |= scan.stamp - max(self.closed_s, self._stands_s) >= CLOSED_S
             self.is_leaving = False
-        elif scan.stamp - self.closed_s >= CLOSED_S:
+        elif self._rode:
             self.is_leaving = True
         else:
             self.leave()
 
     def leave(self) -> None:
         """The robot has left the cabin."""
-        self._smallest_m2, self.closed_s, self.is_leaving = math.inf, math.inf, False
+        self._smallest_m2, self.closed_s, self._rode, self.is_leaving = math.inf, math.inf, False, False
 
 
 def _seen_area_m2(scan: LaserScan) -> float:
