@@ -12,7 +12,7 @@ from fcslam.cloud.joint_graph import JointGraph
 from fcslam.geometry import se2
 from fcslam.graph.evidence import ConsistencySettings
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import Channel, ClosureStatus, KeyscanId, LoopClosure, Reason, ReasonCode, frozen
+from fcslam.records import Channel, ClosureStatus, Keyscan, KeyscanId, LoopClosure, Reason, ReasonCode, frozen
 from fcslam.storage.state_file import read_state, write_state
 from tests.scripted import CLOSURE_INFORMATION, closures, motion, rectangle, stream, verified
 from tests.small_fleet import feed, map_of
@@ -102,6 +102,13 @@ def test_the_ledger_books_what_geometry_says():
     assert ledger.evidence("a", "b") == []
 
 
+def without_returns(packet):
+    """The scripted walls do not fit each other; without any, no map contradicts."""
+    if not isinstance(packet.body, Keyscan):
+        return packet
+    return replace(packet, body=replace(packet.body, ranges_m=np.zeros_like(packet.body.ranges_m)))
+
+
 def test_sessions_that_meet_for_long_without_a_join_are_not_decided_at_every_place(scripted, monkeypatch):
     poses, sizes = rectangle(801), []
 
@@ -113,7 +120,8 @@ def test_sessions_that_meet_for_long_without_a_join_are_not_decided_at_every_pla
     a, b = ("a", poses), ("b", poses)
     vague = closures(a, b, [(k, k) for k in range(0, 600, 4)], informative=False)
     clear = closures(a, b, [(k, k) for k in range(600, 801, 4)])
-    cloud = feed(scripted(vague, clear), [*stream("a", poses, start_s=0.0), *stream("b", poses, start_s=1e4)])
+    packets = [*stream("a", poses, start_s=0.0), *stream("b", poses, start_s=1e4)]
+    cloud = feed(scripted(vague, clear), [without_returns(packet) for packet in packets])
     assert sizes[:100] == list(range(1, 101)), "with little evidence they are"
     grown = np.array(sizes[100:])
     assert (grown[1:] >= 1.05 * grown[:-1]).all()
