@@ -23,6 +23,7 @@ from fcslam.sources.gate import FIRST_MESSAGES, scan_window
 from fcslam.sources.logs.archive import translate_errors
 from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud
 from fcslam.sources.source import WHOLE, ScanRange, Survey
+from fcslam.untrusted import read_bytes, read_text
 
 SUFFIXES: Final = (".bin", ".pcd", ".ply")
 _TIME_FILES: Final = ("times.txt", "timestamps.txt")
@@ -64,7 +65,9 @@ class CloudFolder:
         above = (self._files[0].parent, self._files[0].parent.parent, self.path)
         for file in (place / name for place in above for name in _TIME_FILES):
             if file.is_file():
-                lines = [line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+                with translate_errors(file):
+                    text = read_text(file)
+                lines = [line.strip() for line in text.splitlines() if line.strip()]
                 if len(lines) < len(self._files):
                     raise SourceError(
                         f"{file}: has {len(lines)} times for {len(self._files)} clouds; give one for each"
@@ -113,10 +116,8 @@ class CloudFolder:
 
 def read_cloud(path: Path, stamp: float) -> PointCloud:
     """The cloud in a file."""
-    with translate_errors(path), path.open("rb") as file:
-        content = file.read(_MOST_BYTES + 1)
-    if len(content) > _MOST_BYTES:
-        raise SourceError(f"{path}: is larger than any turn of a LiDAR; give one file for each turn")
+    with translate_errors(path):
+        content = read_bytes(path, most=_MOST_BYTES)
     try:
         values = {".bin": _kitti, ".pcd": _pcd, ".ply": _ply}[path.suffix](content)
         points = np.stack([np.asarray(values[axis], np.float64) for axis in "xyz"], axis=1)
