@@ -19,8 +19,8 @@ from pathlib import Path
 
 import common
 import numpy as np
+from three_d import errors_of
 
-from fcslam.geometry import se3
 from fcslam.records import CloudScan
 from fcslam.robot.backend import SessionConfig
 from fcslam.robot.frontend3d import RobotFrontend3d
@@ -67,20 +67,6 @@ def row_of(bag: Path, sensors: str) -> tuple:
     uplink = sum(len(measure(packet).data) for packet in packets) / 1e3 / float(np.ptp(stamps))
     errors = errors_of(track.T_odom_base(), true)
     return bag.name, sensors, len(stamps), len(robot.tracks), *errors, 1e3 * cpu_s / len(stamps), uplink
-
-
-def errors_of(found: np.ndarray, true: np.ndarray) -> tuple[float, ...]:
-    """Root mean square of the position errors, of those in the plane, the largest one, and the mean angle."""
-    R_found, R_true = se3.rotation(found), se3.rotation(true)
-    moved, fixed = (poses[:, :3] - poses[:, :3].mean(axis=0) for poses in (found, true))
-    u, _, v = np.linalg.svd(fixed.T @ moved + np.einsum("nij,nkj->ik", R_true, R_found))
-    R = u @ np.diag((1.0, 1.0, np.linalg.det(u @ v))) @ v
-    off = moved @ R.T - fixed
-    error, in_plane = np.linalg.norm(off, axis=1), np.hypot(*off[:, :2].T)
-    cosine = (np.einsum("ij,njk,nik->n", R, R_found, R_true) - 1.0) / 2.0
-    angles = np.degrees(np.arccos(cosine.clip(-1.0, 1.0)))
-    rms = [float(np.sqrt((values**2).mean())) for values in (error, in_plane)]
-    return *rms, float(error.max()), float(angles.mean())
 
 
 if __name__ == "__main__":
