@@ -16,14 +16,18 @@ from urllib.parse import urlsplit
 from zipfile import ZipFile
 
 import httpx
+import numpy as np
 import pytest
 import yaml
 
 from fcslam.cli import main
+from fcslam.geometry import se3
+from fcslam.maps.joint_voxels import ply_of
 from fcslam.maps.occupancy_map import parse_map
 from fcslam.maps.palette import APPEARED, FLOOR, ROBOTS, WALL
 from fcslam.page import ASSETS
 from fcslam.page.report import ShownRun, report_html
+from fcslam.records import KeyscanId, VoxelMap
 from tests.cli.test_serve import API, Service, send
 from tests.mission.test_map_changes import write_run
 
@@ -340,6 +344,28 @@ def test_a_report_tells_of_days_of_changes_and_of_accuracy(browser, tmp_path):
         says(page, "#events", "Monday")
         page.get_by_role("button", name="anna begins drive 2").click()
         says(page, "#until", "17/11/2026")
+
+
+def test_a_map_in_space_is_shown_from_above_up_to_a_cut(browser, tmp_path):
+    folder, cells = write_run(tmp_path / "building", (0,)), 5 * np.mgrid[-5:5, -5:5].reshape(2, -1).T
+    points = np.concatenate([np.column_stack((cells, np.full(len(cells), z))) for z in (0, 135)]).astype(np.int16)
+    scanner, seen_from = np.zeros((1, 3), np.int16), np.zeros(len(points), np.uint8)
+    voxels = VoxelMap(KeyscanId("anna", 0), 0, 0, se3.IDENTITY, points, scanner, seen_from)
+    (folder / "map.ply").write_bytes(ply_of([(voxels, se3.IDENTITY)]))
+    floor, ceiling = 0x440154, 0xFDE725
+    with ShownRun(folder) as shown, ThreadPoolExecutor(1) as beside:
+        (tmp_path / "report.html").write_text(beside.submit(asyncio.run, report_html(shown)).result())
+    with closing(browser.new_page(viewport={"width": 1200, "height": 900})) as page:
+        page.goto(f"file://{tmp_path / 'report.html'}")
+        until(page, lambda: pixels(page, [floor])[0] > 100, "the floor, below the ceiling")
+        assert pixels(page, [ceiling]) == [0]
+        page.locator("#height").fill(page.locator("#height").get_attribute("max"))
+        until(page, lambda: pixels(page, [floor])[0] == 0, "the ceiling over the floor")
+        assert pixels(page, [ceiling])[0] > 100
+        page.locator("#layers summary").click()
+        page.get_by_label("3D from above").uncheck()
+        until(page, lambda: pixels(page, [ceiling])[0] == 0, "the plane")
+        assert not page.locator("#height").is_visible()
 
 
 def test_rounds_of_a_federated_training_are_listed(page, mapped):

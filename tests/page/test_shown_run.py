@@ -20,10 +20,11 @@ from fastapi.routing import iter_route_contexts
 
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import InputError
+from fcslam.geometry import se3
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.mission.mission_file import as_stored, mission_bytes
 from fcslam.page import ASSETS, MODULES
-from fcslam.page.report import MOST_TILES, ShownRun, report_html
+from fcslam.page.report import MOST_POINTS_BYTES, MOST_TILES, ShownRun, report_html
 from fcslam.page.routes import run_page
 from fcslam.records import Channel, ClosureStatus, Edit, Reason, ReasonCode, Veto
 from fcslam.runs import ClosureRow, Join, Metric, RobotTrajectory, Run
@@ -197,6 +198,23 @@ def test_a_report_holds_all_that_the_page_asks_for_and_asks_nobody(shown):
         assert gzip.decompress(base64.b64decode(files[path])) == answer.content
     with ZipFile(io.BytesIO(gzip.decompress(base64.b64decode(files["maps/1.zip"])))) as archive:
         assert archive.namelist() == ["map_1.pgm", "map_1.yaml"]
+
+
+@pytest.mark.parametrize("is_small", [True, False])
+def test_points_in_space_are_a_file_of_their_map_and_of_a_report_unless_they_are_too_many(run, tmp_path, is_small):
+    points, poses = bytes(10 if is_small else MOST_POINTS_BYTES + 1), trajectory("b", 1).T_map_base
+    lifted = se3.compose((0.0, 0.0, 1.4, 0.0, 0.0, 0.0, 1.0), se3.from_plane(poses))
+    robots = run.trajectories | {"b": replace(trajectory("b", 1), T_map_base_6d=lifted)}
+    replace(run, map_files=run.map_files | {"map_1.ply": points}, trajectories=robots).save(tmp_path / "run")
+    with ShownRun(tmp_path / "run") as shown:
+        answers = ask(shown, *(f"/api/v1/{path}" for path in ("maps", "robots", "maps/1.ply", "maps/0.ply")))
+        maps, robots, sent, missing = answers
+        ((_, texts), _) = Elements(asyncio.run(report_html(shown))).of("script")
+    assert [one["in_space"] for one in maps.json()] == [False, True]
+    assert [robot["z_m"] for robot in robots.json()] == [None, None, 1.4]
+    assert (sent.content == points, missing.status_code) == (True, 404)
+    held = json.loads(texts)
+    assert ("maps/1.ply" in held["files"]) == is_small == json.loads(held["texts"]["maps"])[1]["in_space"]
 
 
 @pytest.mark.parametrize(("resolution_m", "zoom"), [(2.0, 0), (8.0, 0), (64.0, -1)])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fcslam.geometry import se2
+from fcslam.geometry import se2, se3
 from fcslam.mission.mission_file import as_stored
 from fcslam.mission.mission_store import MissionStore
 from fcslam.runs import RobotTrajectory
@@ -29,6 +29,13 @@ def store(tmp_path):
 def test_a_pose_is_the_drawn_one_moved_by_what_the_robot_drove_since(store, drawn):
     in_map = np.array([se2.compose(T_new_map, pose) for pose in POSES_M])
     trajectory = RobotTrajectory("a", 0, np.arange(float(drawn)), in_map[:drawn])
+    assert live_pose(store, "a", 0, trajectory) == pytest.approx(in_map[-1], abs=0.02)
+
+
+def test_a_robot_that_drives_on_a_floor_keeps_its_height_in_a_map_in_space(store):
+    T_map_odom = se3.compose((3.0, -2.0, 1.4, 0.0, 0.0, 0.0, 1.0), se3.from_plane((0.0, 0.0, 0.7)))
+    in_map = se3.compose(T_map_odom, se3.from_plane(POSES_M))
+    trajectory = RobotTrajectory("a", 0, np.arange(3.0), se3.to_plane(in_map)[:3], T_map_base_6d=in_map[:3])
     assert live_pose(store, "a", 0, trajectory) == pytest.approx(in_map[-1], abs=0.02)
 
 

@@ -9,6 +9,7 @@ MODULES = (
     "geometry.js",
     "service.js",
     "fleet.js",
+    "heights.js",
     "map.js",
     "tools.js",
     "panels.js",

@@ -40,6 +40,8 @@ from fcslam.service.viewed_mission import PacketCounts, ViewedMission, viewed_ru
 
 MOST_CLOSURES = 5000
 """Largest number of closures of each status that the page asks for."""
+MOST_POINTS_BYTES = 32_000_000
+"""Largest file of points that the report holds: about a million points."""
 MOST_TILES = 200
 """Most tiles of all maps together: a tile has about 15 kB. For a larger map, the file holds coarser tiles."""
 _IMPORT = re.compile(r"^import (\{[^}]*\}) from \"\./(\w+)\.js\";\n", re.MULTILINE)
@@ -134,9 +136,12 @@ async def report_html(mission: ViewedMission) -> str:
         texts += [f"maps/{one['map']}/walls" for one in drawn]
         texts += [f"{TRAJECTORIES}/{quote(one['session'], safe='')}.tum" for one in robots if one["T_map_base"]]
         texts += sorted(found & {METRICS, CONFIG, f"{QUALITY}.json"})
+        for one in maps:
+            one["in_space"] = one["in_space"] and len(await get(f"maps/{one['map']}.ply")) <= MOST_POINTS_BYTES
         files = [f"maps/{one['map']}.png" for one in drawn if f"{map_stem(one['map'])}.png" in found]
         files += [f"maps/{one['map']}.{suffix}" for one in drawn for suffix in ("zip", "svg")]
         files += [f"maps/{one['map']}.tif" for one in drawn if one["georeferenced"]]
+        files += [f"maps/{one['map']}.ply" for one in maps if one["in_space"]]
         files += sorted(found & {POSE_GRAPH}) + [f"{TRAJECTORIES}.zip"] * bool(robots)
         tiles = [path for one in drawn for path in _tiles(one)]
         responses = {

@@ -201,8 +201,7 @@ def _write(run: Run, folder: Path) -> None:
     (folder / TRAJECTORIES).mkdir()
     for trajectory in run.trajectories.values():
         file = folder / TRAJECTORIES / f"{trajectory.robot}.tum"
-        in_space = trajectory.T_map_base_6d
-        write_tum(file, trajectory.stamps, trajectory.T_map_base if in_space is None else in_space)
+        write_tum(file, trajectory.stamps, trajectory.poses)
     if run.local_maps:
         (folder / LOCAL).mkdir()
     for local in run.local_maps.values():

@@ -28,6 +28,11 @@ class RobotTrajectory:
     """The same poses with six degrees of freedom, (x, y, z, qx, qy, qz, qw), shape (N, 7); None: of a map in 2D."""
 
     @property
+    def poses(self) -> FloatArray:
+        """The poses with all degrees of freedom that the map has, shape (N, 3) or (N, 7)."""
+        return self.T_map_base if self.T_map_base_6d is None else self.T_map_base_6d
+
+    @property
     def path_length_m(self) -> float:
         """Length of the polygon through the positions."""
         steps = np.diff(self.T_map_base[:, :2], axis=0)

@@ -8,6 +8,7 @@ import numpy as np
 from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.errors import InputError
 from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2, group_of
 from fcslam.lidar.scan import keyscan_points
 from fcslam.lidar.submap import SPACING_M
 from fcslam.maps.drawing import closure_png
@@ -25,20 +26,22 @@ SAME_S = 1e-3
 
 
 def live_pose(store: MissionStore, robot: str, epoch: int, drawn: RobotTrajectory) -> FloatArray:
-    """Newest pose in the map, shape (3,), metres and radians.
+    """Newest pose in the map, in the plane (3,) or in space (7,), metres and radians.
 
     It is the last pose that is ``drawn`` in the map, moved by the robot's motions since then.
     """
-    last: FloatArray = drawn.T_map_base[-1]
+    poses = drawn.poses
+    last: FloatArray = poses[-1]
     anchors = store.keyscans_near(robot, epoch, float(drawn.stamps[-1]), 1)
     if not anchors:
         return last
     anchor = anchors[0]
-    pose = drawn.T_map_base[int(np.argmin(np.abs(drawn.stamps - anchor.stamp)))]
+    pose, group = poses[int(np.argmin(np.abs(drawn.stamps - anchor.stamp)))], group_of(last)
     number = moved = anchor.id.number
     for step in store.constraints_since(robot, epoch, anchor.stamp):
         if step.kind is ConstraintKind.ODOMETRY and (step.i, step.j) == (moved, moved + 1):
-            pose, moved = se2.compose(pose, step.T_i_j), step.j
+            is_planar = group_of(step.T_i_j) is SE2
+            pose, moved = group.compose(pose, group.from_plane(step.T_i_j) if is_planar else step.T_i_j), step.j
     return last if moved == number else pose
 
 

@@ -130,7 +130,7 @@ def test_a_full_disk_is_507_and_nothing_is_acknowledged(desk):
 
 
 def one_map(robots, layers):
-    summary = {"map": 0, "floor": "", "zoom": 5, "extent": ANY, "georeferenced": False}
+    summary = {"map": 0, "floor": "", "zoom": 5, "extent": ANY, "in_space": False, "georeferenced": False}
     return {**summary, "robots": robots, "layers": layers}
 
 

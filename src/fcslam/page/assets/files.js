@@ -25,9 +25,9 @@ const stem = (map) => (map ? `map_${map}` : "map");
 
 export function showFiles() {
   const { maps, readOnly, mayEdit, mission } = fleet, card = (title, text, ...buttons) => { const item = element("li", element("h3", title)); item.append(element("p", text), ...buttons); return item; };
-  fill(at("files"), [mission, maps.map((m) => [m.map, m.robots, m.extent, m.georeferenced]), mayEdit], () => [
+  fill(at("files"), [mission, maps.map((m) => [m.map, m.robots, m.extent, m.in_space, m.georeferenced]), mayEdit], () => [
     ...maps.filter((m) => m.extent).map((m) => card(maps.length > 1 ? `Map of ${listed(m.robots)}` : "Map", "For Nav2 and other programs of ROS: a picture of cells and its description, in one archive.",
-      ...[["Map for Nav2", "zip"], ["Picture", "png"], ["Drawing", "svg"], ...(m.georeferenced ? [["On the earth", "tif"]] : [])].map(([name, end]) => download(`${name} (${end})`, `maps/${m.map}.${end}`, `${stem(m.map)}.${end}`)))),
+      ...[["Map for Nav2", "zip"], ["Picture", "png"], ["Drawing", "svg"], ...(m.in_space ? [["Points in 3D", "ply"]] : []), ...(m.georeferenced ? [["On the earth", "tif"]] : [])].map(([name, end]) => download(`${name} (${end})`, `maps/${m.map}.${end}`, `${stem(m.map)}.${end}`)))),
     card("Paths", "Where each robot was, and when, as text in the format of TUM; and all measurements between scans, in the format g2o.",
       download("Paths (zip)", "trajectories.zip", "paths.zip"), download("Pose graph (g2o)", "pose_graph.g2o", "pose_graph.g2o")),
     ...(report ? [] : [card("Report", "This page as one file that needs no service. It opens in any browser.", download("Report (html)", "report.html", "report.html"))]),

@@ -24,15 +24,15 @@ async function trail(name) {
   const answer = await ask(known ? `${path}?after=${known.bytes}&digest=${known.digest}` : path);
   const text = await answer.text(), after = Number(answer.headers.get("Fcslam-After")), digest = answer.headers.get("Fcslam-Digest");
   const poses = text.split("\n").filter((l) => l && l[0] !== "#").map((l) => {
-    const [stamp, x, y, , , , qz, qw] = l.split(" ").map(Number);
-    return [stamp, x, y, 2 * Math.atan2(qz, qw)];
+    const [stamp, x, y, z, qx, qy, qz, qw] = l.split(" ").map(Number);
+    return [stamp, x, y, Math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)), z];
   });
   const all = !after ? poses : poses.length ? known.poses.concat(poses) : known.poses;
   if (digest) received.set(name, { bytes: after + text.length, digest, poses: all });
   return all;
 }
 
-// Where a robot was at a stamp: x, y, heading in its map; undefined if nobody knows.
+// Where a robot was at a stamp: x, y, heading and z in its map; undefined if nobody knows.
 export function poseAt(name, stamp) {
   const path = fleet.trails.get(name);
   if (!path?.length) return undefined;
@@ -74,7 +74,7 @@ export async function look() {
   const [counts, robots] = await Promise.all([json("fleet"), json("robots")]), known = new Map(robots.map((r) => [r.session, r]));
   for (const robot of fleet.robots) {
     const now = known.get(robot.session);
-    if (now?.map === robot.map) robot.T_map_base = now.T_map_base;
+    if (now?.map === robot.map) Object.assign(robot, { T_map_base: now.T_map_base, z_m: now.z_m });
     robot.last_heard_s = now?.last_heard_s ?? null;
   }
   fleet.counts = counts; fleet.readAt = Date.now();

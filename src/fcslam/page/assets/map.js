@@ -2,6 +2,7 @@
 
 import { colourOf, fleet, isPast, keyOf, poseAt, robotNamed } from "./fleet.js";
 import { distance, middle, movedPoint } from "./geometry.js";
+import { drawHeights, forgetHeights, heightText, onHeights } from "./heights.js";
 import { Failed, Refused, ask, at, json, report } from "./service.js";
 
 const WORLD_M = 512, TILE_PX = 512, MOST_TILES = 48, RETRY_MS = 2000;
@@ -162,6 +163,7 @@ function drawTiles(brush, index, { x, y, scale, turn }, w, h) {
 // ---- Layers ----
 
 export const isShown = (layer) => at(`layer-${layer}`).checked && !at(`layer-${layer}`).parentElement.hidden;
+const isInSpace = () => Boolean(fleet.maps.find((m) => m.map === chart.index)?.in_space);
 export function redraw() { if (!queued) { queued = true; requestAnimationFrame(draw); } }
 
 // A robot's path until the moment, in metres of the map: all of it, its last minutes, and its last pose. Poses nearer than a pixel are left out.
@@ -265,7 +267,7 @@ function drawRobot(robot) {
   pen.lineJoin = "round"; pen.lineWidth = isChosen ? 7 : 4; pen.strokeStyle = isChosen ? theme.accent : theme.surface; pen.stroke();
   pen.fillStyle = colour; pen.fill();
   pen.restore();
-  if (isShown("names")) nameRobot(robot.robot, [px, py]);
+  if (isShown("names")) nameRobot(isInSpace() ? `${robot.robot}, z ${heightText((isNow ? robot.z_m : null) ?? last[4])}` : robot.robot, [px, py]);
 }
 const isEarlierDrive = (robot) => fleet.robots.some((r) => r.robot === robot.robot && r.epoch > robot.epoch && r.map === robot.map);
 
@@ -286,7 +288,7 @@ const LOOKS = { // colour, width of the line, filling
   tags: { tag: ["camera", 2, 0.4] },
 };
 const shapes = new Map();
-export function forgetShapes() { shapes.clear(); redraw(); }
+export function forgetShapes() { shapes.clear(); forgetHeights(); redraw(); }
 // The newest ones that have come, as for tiles; an answer that comes after another mission was opened is dropped with its key.
 function shapesOf(layer) {
   const path = `maps/${chart.index}/layers/${layer}`, key = `${fleet.mission}/${path}`, kept = shapes.get(key) ?? { found: [], version: -1, isAsked: false };
@@ -311,6 +313,7 @@ function drawShapes(layer) {
 export function showLayers() {
   const known = fleet.maps.find((m) => m.map === chart.index)?.layers ?? [];
   for (const layer of Object.keys(LOOKS)) at(`layer-${layer}`).parentElement.hidden = !known.includes(layer);
+  at("layer-heights").parentElement.hidden = !isInSpace();
 }
 
 function draw() {
@@ -328,6 +331,8 @@ function draw() {
   }
   // A tile in view stays, or each drawing would ask for it again.
   for (const [key, { picture }] of tiles) { if (tiles.size <= Math.max(MOST_TILES, drawn)) break; picture?.close(); tiles.delete(key); }
+  if (isShown("heights")) drawHeights(pen, chart.index, view, w, h);
+  else at("cut").hidden = true;
   for (const layer of Object.keys(LOOKS)) if (isShown(layer)) drawShapes(layer);
   if (isShown("grid")) drawGrid();
   if (isShown("closures")) for (const [channel, colour] of [["lidar", theme.laser], ["camera", theme.camera], ["tag", theme.free]]) strokeWay(linksOf(channel), colour, 1, 0.5);
@@ -429,4 +434,5 @@ canvas.addEventListener("keydown", (e) => {
   const press = chart.tool?.keys?.[e.key] ?? keys[e.key];
   if (press) { e.preventDefault(); press(); }
 });
+onHeights(redraw);
 new ResizeObserver(() => { measure(); redraw(); }).observe(canvas);

@@ -2,6 +2,7 @@
 
 import { colourOf, closures, firstStamp, fleet, keyOf, placed, robotNamed } from "./fleet.js";
 import { between, distance, middle, turned } from "./geometry.js";
+import { heightText } from "./heights.js";
 import { chart, choose, fit, goTo, openMap, redraw, showLayers } from "./map.js";
 import { ask, at, json, link, report } from "./service.js";
 import { change, tell } from "./tools.js";
@@ -119,7 +120,7 @@ export function showFleet() {
     seen.textContent = newest.length > 1 && robot.map !== null ? evidenceNow.words.get(robot.session) : "";
     joined.textContent = joinsOf(robot, fleet.robots, fleet.joins);
     const heard = fleet.readOnly || robot.last_heard_s === null ? [] : [`heard ${duration(robot.last_heard_s)} ago`], sent = fleet.counts.metrics[`uplink_bytes_${robot.robot}`];
-    const parts = [`drove ${metres(robot.path_length_m)}`, `${count(robot.keyscans, "scan")} on the map`, ...(robot.floor ? [`floor ${robot.floor}`] : []), ...(sent ? [`${(sent / 1000).toLocaleString("en", { maximumFractionDigits: 0 })} kB sent`] : []), ...heard];
+    const parts = [`drove ${metres(robot.path_length_m)}`, `${count(robot.keyscans, "scan")} on the map`, ...(robot.z_m === null ? [] : [`height ${heightText(robot.z_m)}`]), ...(robot.floor ? [`floor ${robot.floor}`] : []), ...(sent ? [`${(sent / 1000).toLocaleString("en", { maximumFractionDigits: 0 })} kB sent`] : []), ...heard];
     facts.textContent = `${parts.join("; ")}. ${Object.entries(robot.detectors).map(([channel, made]) => `Detector (${channel}): ${made}.`).join(" ")}`;
     const before = fleet.robots.filter((r) => r.robot === robot.robot && r.epoch < robot.epoch);
     fill(earlier, before.map((r) => [r.session, r.path_length_m]), () => before.map((r) => element("li", `Drive ${r.epoch + 1}, ${r.first_s === null ? "not on the map" : `from ${moment(r.first_s, firstStamp(), true)}`}: ${metres(r.path_length_m)}`)));

@@ -21,8 +21,9 @@ import fcslam
 from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import InputError, StoreError
+from fcslam.geometry.groups import SE3, group_of
 from fcslam.maps.palette import robot_colors
-from fcslam.records import Channel, ClosureStatus, Edit
+from fcslam.records import Channel, ClosureStatus, Edit, FloatArray
 from fcslam.runs import ClosureRow, Run
 from fcslam.service.http.authentication import VIEWERS, Role
 from fcslam.service.http.responses import (
@@ -187,7 +188,7 @@ def _sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
         known, hello = mapped.get(name), store.newest_hello(robot, session.epoch)
         stored = store.correction(robot, session.epoch)
         correction = stored.correction if stored else None
-        pose = known.T_map_base[-1] if known else None
+        pose = known.poses[-1] if known else None
         if known and heard_s is not None:  # nobody is heard in a finished run
             pose = live_pose(store, robot, session.epoch, known)
         sessions.append(
@@ -203,8 +204,9 @@ def _sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
                 color=f"#{colors[name]:06x}",
                 first_s=float(known.stamps[0]) if known else None,
                 last_s=float(known.stamps[-1]) if known else None,
-                T_map_base=pose.tolist() if pose is not None else None,
-                T_map_odom=correction.T_map_odom.tolist() if correction else None,
+                T_map_base=_in_plane(pose) if pose is not None else None,
+                z_m=float(pose[2]) if pose is not None and group_of(pose) is SE3 else None,
+                T_map_odom=_in_plane(correction.T_map_odom) if correction else None,
                 correction=correction.version if correction else -1,
                 quality=correction.quality if correction else 0.0,
                 removed=is_removed(name, changes),
@@ -213,6 +215,12 @@ def _sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
             )
         )
     return sessions
+
+
+def _in_plane(pose: FloatArray) -> list[float]:
+    """x, y and heading."""
+    planar: list[float] = group_of(pose).to_plane(pose).tolist()
+    return planar
 
 
 @lru_cache(maxsize=8)  # many pages ask for the same

@@ -46,6 +46,7 @@ MEDIA = {
     "svg": "image/svg+xml",
     "tif": "image/tiff",
     "zip": "application/zip",
+    "ply": "application/octet-stream",
 }
 
 _OBJECT: dict[str, Any] = {"type": "object"}
@@ -80,6 +81,7 @@ def map_router(state: ViewerState) -> APIRouter:
                 robots=[r.robot for r in robots if r.map_index == k],
                 **_tiling(folder, map_stem(k)),
                 layers=layers_of(state.mission, k),
+                in_space=folder is not None and (folder / f"{map_stem(k)}.ply").is_file(),
                 georeferenced=folder is not None and earth_frame(folder, k) is not None,
             )
             for k, floor in sorted({robot.map_index: robot.floor for robot in robots}.items())
@@ -95,11 +97,15 @@ def map_router(state: ViewerState) -> APIRouter:
             for one in separations(run_of(state.mission))
         ]
 
-    @router.get("/maps/{k}.{suffix}", **file_of(*MEDIA.values(), refused=(400, 404)))
-    def get_map(k: Index, suffix: Annotated[str, PathParameter(pattern="^(png|pgm|yaml|svg|tif|zip)$")]) -> Response:
-        """A map: picture, occupancy, what map_server needs to know of it, both in one archive, drawing, and GeoTIFF if
-        its place on earth is known.
+    @router.get("/maps/{k}.{suffix}", **file_of(*MEDIA.values(), refused=(400, 404), is_tagged=True))
+    def get_map(
+        request: Request, k: Index, suffix: Annotated[str, PathParameter(pattern="^(png|pgm|yaml|svg|tif|zip|ply)$")]
+    ) -> Response:
+        """A map: picture, occupancy, what map_server needs to know of it, both in one archive, drawing, GeoTIFF if its
+        place on earth is known, and points in space if robots with 3D LiDARs made it.
         """
+        if suffix == "ply":
+            return unless_known(request, read_bytes(_existing(state, f"{map_stem(k)}.ply")), MEDIA[suffix])
         if suffix not in ("svg", "tif", "zip"):
             return FileResponse(_existing(state, f"{map_stem(k)}.{suffix}"), media_type=MEDIA[suffix])
         exported = export_map(_folder_of(state), k, suffix)

@@ -81,6 +81,7 @@ class SessionSummary(StrictModel):
     T_map_base: Pose | None = Field(
         description="newest pose, x and y in metres, theta in radians; it may be newer than the map"
     )
+    z_m: float | None = Field(description="height of the newest pose, metres; null in a map of the plane")
     T_map_odom: Pose | None = Field(description="frame of its odometry in the map, x and y in metres, theta in radians")
     correction: int = Field(description="version of the newest correction; -1: none")
     quality: float = Field(description="how well other sessions support the pose, in [0, 1]; 0: no support")
@@ -137,6 +138,7 @@ class MapSummary(StrictModel):
         description="lowest x and y, highest x and y that the map covers, in metres; null before there is a map"
     )
     layers: list[MapLayer] = Field(description="what can be drawn over it")
+    in_space: bool = Field(description="whether the map is three-dimensional: it has points, as PLY")
     georeferenced: bool = Field(description="whether its place on the earth is known")
 
 
