@@ -4,7 +4,17 @@ import math
 
 import numpy as np
 
-from fcslam.sources.bags.codec import CAMERA_INFO, FIX, IMAGE, MULTI_ECHO_SCAN, ODOMETRY, SCAN, TRANSFORMS, MessageCodec
+from fcslam.sources.bags.codec import (
+    CAMERA_INFO,
+    FIX,
+    IMAGE,
+    IMU,
+    MULTI_ECHO_SCAN,
+    ODOMETRY,
+    SCAN,
+    TRANSFORMS,
+    MessageCodec,
+)
 from fcslam.sources.bags.transforms import in_space
 
 CODEC = MessageCodec(ros1=False)
@@ -74,6 +84,15 @@ def fix(stamp, latitude, longitude, frame="gnss"):
     return CODEC.make(
         FIX, header=header(stamp, frame), status=status, latitude=latitude, longitude=longitude, altitude=400.0,
         position_covariance=np.zeros(9), position_covariance_type=0,
+    )  # fmt: skip
+
+
+def imu(stamp, rate_rad_s, frame="imu"):
+    return CODEC.make(
+        IMU, header=header(stamp, frame), orientation=CODEC.rotation(in_space(np.zeros(3))),
+        orientation_covariance=np.zeros(9), angular_velocity=CODEC.vector("Vector3", z=rate_rad_s),
+        angular_velocity_covariance=np.zeros(9), linear_acceleration=CODEC.vector("Vector3", z=9.81),
+        linear_acceleration_covariance=np.zeros(9),
     )  # fmt: skip
 
 

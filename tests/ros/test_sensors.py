@@ -11,7 +11,7 @@ from fcslam.ros.live_plan import PATIENCE_S, SCANS_FOR_RIG
 from fcslam.ros.sensors import ODOMETRY_PATIENCE_S, STEPS_BACK_FOR_RESTART, LiveSensors
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources import BagOptions
-from fcslam.sources.bags.codec import CAMERA_INFO, FIX, IMAGE, MULTI_ECHO_SCAN, POINT_CLOUD
+from fcslam.sources.bags.codec import CAMERA_INFO, FIX, IMAGE, IMU, MULTI_ECHO_SCAN, POINT_CLOUD
 from fcslam.sources.faults import Fault
 from fcslam.wire.limits import MAXIMUM_BEAMS
 from tests.ros.ros_messages import (
@@ -23,6 +23,7 @@ from tests.ros.ros_messages import (
     fix,
     header,
     image,
+    imu,
     multi_echo,
     odometry,
     scan,
@@ -38,10 +39,12 @@ RANGES = np.full(180, 5.0)
 class Robot:
     """Feeds messages to sensors and keeps what comes out."""
 
-    def __init__(self, odometry="/odom", kinds=KINDS, camera=None, info=None, scans=("/scan",), fixes=None, **options):
+    def __init__(
+        self, odometry="/odom", kinds=KINDS, camera=None, info=None, scans=("/scan",), fixes=None, imu=None, **options
+    ):
         self.said = []
         self.kinds = kinds
-        topics = SensorTopics(kinds, scans, odometry, ("/tf", "/tf_static"), camera, info, fixes)
+        topics = SensorTopics(kinds, scans, odometry, ("/tf", "/tf_static"), camera, info, fixes, (), imu)
         self.sensors = LiveSensors(topics, "", BagOptions(**options), self.hears_of)
         self.records = []
         self.now_s = 0.0
@@ -50,9 +53,9 @@ class Robot:
         if line not in self.said:
             self.said.append(line)
 
-    def hears(self, topic, message):
+    def hears(self, topic, message, received_s=1e-9):
         payload = message if isinstance(message, bytes) else encoded(self.kinds[topic], message)
-        self.records += self.sensors.add(topic, payload, self.now_s, 1)
+        self.records += self.sensors.add(topic, payload, self.now_s, round(received_s * 1e9))
         return self
 
     def drives(self, stamps, offset=0.0):
@@ -316,16 +319,107 @@ def test_depth_images_wait_for_their_calibration():
 
 def test_a_fix_of_satellite_navigation_has_the_antenna_that_tf_says():
     robot = Robot(kinds={**KINDS, "/fix": FIX}, fixes="/fix")
-    robot.hears("/fix", fix(0.5, 47.0, 8.5))  # nobody knows yet where the antenna sits
+    robot.hears("/fix", fix(0.5, 47.0, 8.5))  # it waits until it is known where the antenna sits
     robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
     robot.hears("/tf_static", transform(0.0, "base_link", "gnss", (-0.3, 0.2, 0.0)))
     robot.drives(np.arange(1.0, 9.0))
     robot.hears("/fix", fix(8.1, 47.0, 8.5)).hears("/fix", fix(8.2, 0.0, 0.0)).hears("/fix", fix(8.3, 191.0, 8.5))
     found = [record for record in robot.records if isinstance(record, GnssFix)]
-    assert [(each.stamp, each.latitude_deg, each.longitude_deg) for each in found] == [(8.1, 47.0, 8.5)]
-    assert found[0].antenna_xy == pytest.approx((-0.3, 0.2))
+    expected = [(0.5, 47.0, 8.5), (8.1, 47.0, 8.5)]
+    assert [(each.stamp, each.latitude_deg, each.longitude_deg) for each in found] == expected
+    assert all(each.antenna_xy == pytest.approx((-0.3, 0.2)) for each in found)
     assert robot.sensors.audit.faults()[Fault.FIX_AT_ZERO].count == 1
     assert robot.sensors.audit.faults()[Fault.BROKEN_MESSAGE].count == 1
+
+
+WALL_S = 1_700_000_000.0
+
+
+@pytest.mark.parametrize("ahead_s", [18.0, -3600.0])
+@pytest.mark.parametrize("in_tf", [False, True])
+def test_clocks_that_differ_are_those_by_which_messages_arrive(robot, ahead_s, in_tf):
+    robot = Robot(None if in_tf else "/odom", kinds={**KINDS, "/fix": FIX}, fixes="/fix")
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    for now_s in WALL_S + np.arange(1.0, 15.0, 0.5):
+        at, pose = now_s + ahead_s, (now_s - WALL_S, 0.0, 0.0)
+        robot.hears("/fix", fix(at, 47.0, 8.5), now_s).hears("/tf", transform(now_s, "map", "odom"), now_s)
+        moved = ("/tf", transform(at, "odom", "base_link", pose)) if in_tf else ("/odom", odometry(at, pose))
+        robot.hears(*moved, now_s).hears("/scan", scan(now_s - 0.01, RANGES), now_s)
+    scans = [record for record in robot.records if not isinstance(record, GnssFix)]
+    fixes = [record for record in robot.records if isinstance(record, GnssFix)]
+    assert [record.stamp for record in scans[:3]] == pytest.approx(WALL_S + np.array([0.99, 1.49, 1.99]))
+    assert [record.T_odom_base[0] for record in scans[:3]] == pytest.approx([1.0, 1.5, 2.0], abs=0.03)
+    assert [record.stamp for record in fixes] == pytest.approx(WALL_S + np.arange(1.0, 15.0), abs=0.03)
+    assert [line.partition(" is ")[0] for line in robot.said] == [
+        f"the clock of {'the odometry in tf' if in_tf else '/odom'}", "the clock of /fix",
+    ]  # fmt: skip
+    assert all(f" {ahead_s:.2f}" in line.replace(f"{ahead_s + 0.01:.3f}", f"{ahead_s:.2f}") for line in robot.said)
+
+
+@pytest.mark.parametrize("is_zero", [lambda k: k < 7, lambda k: k % 2 == 0, lambda k: k > 6])
+def test_stamps_of_zero_are_read_by_the_clock_of_the_others(robot, is_zero):
+    for k in range(20):
+        now_s = 0.5 * k + 100.0
+        robot.hears("/odom", odometry(now_s, (now_s, 0.0, 0.0)), WALL_S + now_s)
+        robot.hears("/scan", scan(0.0 if is_zero(k) else now_s, RANGES), WALL_S + now_s)
+    robot.hears("/odom", odometry(110.0, (110.0, 0.0, 0.0)), WALL_S + 110.0)
+    assert robot.stamps == pytest.approx(np.arange(100.0, 110.0, 0.5))
+    assert robot.said == ["/scan has messages without a stamp; the times at which they arrive count"]
+
+
+def test_a_robot_that_never_stamps_has_the_times_at_which_messages_arrive(robot):
+    for k in range(20):
+        robot.now_s = 0.5 * k
+        robot.hears("/odom", odometry(0.0, (0.5 * k, 0.0, 0.0)), WALL_S + 0.5 * k)
+        robot.hears("/scan", scan(0.0, RANGES), WALL_S + 0.5 * k)
+    assert robot.stamps == pytest.approx(WALL_S + np.arange(0.0, 10.0, 0.5))
+
+
+def test_a_gyro_turns_a_robot_without_wheels():
+    robot = Robot(None, {**KINDS, "/imu": IMU}, imu="/imu", odom_topic="none")
+    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot.hears("/tf_static", transform(0.0, "base_link", "imu", (0.0, 0.0, 0.0), height_m=0.1))
+    for k in range(300):
+        now_s = 1.0 + 0.01 * k
+        if k % 20 == 0:
+            robot.hears("/scan", scan(now_s - 0.15, RANGES, beam_s=0.15 / 179))
+        robot.hears("/imu", imu(now_s, 0.1 * k))
+    assert robot.stamps == pytest.approx(1.0 + 0.2 * np.arange(15) - 0.15)
+    for before, record in itertools.pairwise(robot.records):
+        assert record.gyro[:, 1] == pytest.approx(10.0 * (record.gyro[:, 0] - 1.0), abs=1e-6)
+        assert before.stamp + 0.15 <= record.gyro[0, 0] + 1e-6
+        assert record.gyro[-1, 0] >= record.stamp + 0.15 - 1e-6
+    silent = scan(10.0, RANGES)  # a gyro that has stopped holds no scan
+    assert robot.hears("/scan", silent).stamps[-1] == 10.0
+
+
+@pytest.mark.parametrize("period_s", [0.1, 0.25, 1.0])
+def test_times_of_points_in_shares_of_a_turn_are_named(period_s):
+    robot = Robot(kinds={**KINDS, "/points": POINT_CLOUD}, scans=("/points",))
+    robot.hears("/tf_static", transform(0.0, "base_link", "lidar", LASER_POSE, height_m=0.4))
+    measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rotation(yaw=LASER_POSE[2]), rings=8)
+    shares = measured._replace(times=measured.times / PERIOD_S)
+    for stamp in 1.0 + period_s * np.arange(12):
+        robot.hears("/odom", odometry(stamp, (0.0, 0.0, 0.0)))
+        robot.hears("/points", CODEC.encode(cloud(stamp, shares, VELODYNE), POINT_CLOUD))
+    assert "times that are no seconds" in " ".join(robot.said)
+    assert robot.records
+    assert all(record.sweep is None for record in robot.records)
+
+
+def test_a_camera_that_looks_up_by_tf_is_turned_and_named():
+    kinds = {**KINDS, "/depth/image": IMAGE, "/depth/camera_info": CAMERA_INFO}
+    robot = Robot(kinds=kinds, scans=("/depth/image",))
+    frame, info = depth_image(1.0, "32FC1")
+    robot.hears("/depth/camera_info", CODEC.encode(info, CAMERA_INFO))
+    robot.hears("/tf_static", transform(0.0, "base_link", "camera_link", (0.0, 0.0, 0.0), height_m=0.5))
+    for stamp in 1.2 + 0.1 * np.arange(SCANS_FOR_RIG + 3):
+        frame.header = header(stamp, "camera_link")
+        robot.hears("/odom", odometry(stamp, (0.0, 0.0, 0.0))).hears("/depth/image", CODEC.encode(frame, IMAGE))
+    assert "so 'camera_link' is not its optical frame; corrected" in " ".join(robot.said)
+    record = robot.records[0]
+    errors = np.abs(record.ranges_m - plan_ranges(0.0, 0.0, record.laser.angles_rad()))
+    assert np.nanmedian(errors) < 0.005
 
 
 def turned(message, **numbers):

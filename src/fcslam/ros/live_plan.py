@@ -69,9 +69,10 @@ class LivePlanner:
         """The frame of the odometry, or else a usual one that tf has."""
         return self.base_frame or next((frame for frame in USUAL_BASES if frame in self.tree), USUAL_BASES[-1])
 
-    def add_scan(self, scan: ScanMessage) -> None:
-        """Take one of the first scans of a laser."""
-        self._first[scan.laser].append(scan)
+    def add_scan(self, scan: ScanMessage, is_stamped: bool = True) -> None:
+        """Take one of the first scans of a laser; those without a stamp are not enough, as others show the clock."""
+        if is_stamped or len(self._first[scan.laser]) < SCANS_FOR_RIG - 1:
+            self._first[scan.laser].append(scan)
 
     def add_reading(self, reading: OdometryReading) -> None:
         """Take a message of odometry."""

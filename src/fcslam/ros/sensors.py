@@ -5,32 +5,47 @@ for the odometry at its stamp. If that does not come, it gets the nearest pose w
 whose odometry is silent from the start is mapped without.
 """
 
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterator
 from math import inf
+from typing import Any, NamedTuple
 
 from fcslam.records import GnssFix, SensorRecord
 from fcslam.ros.live_plan import LivePlan, LivePlanner, Notify, missing_mounting
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.camera import ImageMessage, calibration_of, image_of
-from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting
+from fcslam.sources.bags.clocks import FEWEST_LAGS, StampClock, ahead_note, clock_ahead_s, restamped
+from fcslam.sources.bags.clouds import (
+    cloud_mounting,
+    cloud_of,
+    given_cloud_mounting,
+    lacks_optical_frame,
+    longest_cloud_s,
+    notes_on_times,
+    optical_note,
+)
 from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     FIX,
     IMAGE,
+    IMU,
     LASER_SCANS,
+    NANOSECONDS,
     ODOMETRY,
     TRANSFORMS,
     MessageCodec,
 )
-from fcslam.sources.bags.fixes import fix_of
+from fcslam.sources.bags.fixes import FixReader
+from fcslam.sources.bags.imu import ImuAxes, ImuReading, imu_of
 from fcslam.sources.bags.messages import (
     OdometryReading,
     ScanMessage,
+    header_of,
     odometry_in,
     odometry_of,
     scan_of,
+    stamp_ns_of,
     transforms_of,
 )
 from fcslam.sources.bags.options import BagOptions
@@ -52,6 +67,18 @@ STEPS_BACK_FOR_RESTART = 3
 """Number of scans in a row that are far back in time until the clock is taken to have stepped back."""
 _LONGEST_WAIT = 10_000
 """Most first messages that wait for the mounting."""
+
+
+Item = Message | ImuReading
+
+
+class _Early(NamedTuple):
+    """One of the first messages, or what it holds."""
+
+    topic: str
+    number: int
+    received_ns: int
+    item: Any
 
 
 class _Patience:
@@ -86,6 +113,15 @@ class LiveSensors:
         self._newest_stamp: float | None = None
         self._topics, self._options, self._notify = topics, options, notify
         self._codec = MessageCodec(ros1=False)
+        self._clocks: defaultdict[str, StampClock] = defaultdict(StampClock)
+        """By topic."""
+        self._scan_lags_s: list[float] = []
+        """Times from measuring to receiving of the first scans of the first laser."""
+        self._odometry_ahead_s = self._imu_ahead_s = 0.0
+        """How far these clocks are ahead of that of the scans."""
+        self._cloud_stamps: dict[str, float] = {}
+        """Stamp of the newest cloud, by topic, and the least time between two of them."""
+        self._intervals_s: dict[str, float] = {}
         self._directions: dict[str, int] = {}
         """Directions of the scans of clouds in a full turn, by topic; the first cloud decides."""
         self._frames: dict[str, str] = {}
@@ -94,7 +130,10 @@ class LiveSensors:
         self._plan: LivePlan | None = None
         """How the robot is read, once that is known."""
         self._reader: SensorReader | None = None
-        self._early: deque[tuple[int, Message]] = deque(maxlen=_LONGEST_WAIT)
+        self._early: deque[_Early] = deque(maxlen=_LONGEST_WAIT)
+        self._axes: ImuAxes | None = None
+        self._fixes: FixReader | None = None
+        self._early_fixes: deque[_Early] = deque(maxlen=_LONGEST_WAIT)
         self._counts: Counter[str] = Counter()
         self._misplaced = 0
         self._next_image_s = -inf
@@ -124,7 +163,7 @@ class LiveSensors:
             if self._reader is not None:
                 yield from self._read(self._reader, self._counts[topic], item)
             elif not isinstance(item, ImageMessage):  # images are large, and the first ones show little
-                self._early.append((self._counts[topic], item))
+                self._early.append(_Early(topic, self._counts[topic], received_ns, item))
         yield from self.wait(now_s)
 
     def wait(self, now_s: float) -> Iterator[SensorRecord]:
@@ -134,8 +173,11 @@ class LiveSensors:
             if self._plan is None:
                 return
             self._reader = self._new_reader(self._plan)
+            self._decide_clocks(self._plan)
             while self._early:
-                yield from self._read(self._reader, *self._early.popleft())
+                topic, number, received_ns, item = self._early.popleft()
+                item = restamped(item, received_ns, self._clocks[topic].lag_ns)
+                yield from self._read(self._reader, number, item)
         reader = self._reader
         silent = reader.silent_lasers
         if self._laser_patience.is_over(bool(silent), now_s):
@@ -159,30 +201,71 @@ class LiveSensors:
             if now_s < self._next_image_s:
                 return True
             self._next_image_s = now_s + RAW_IMAGE_PERIOD_S
-        # Once the mountings are known, tf has nothing but the odometry.
-        return self._plan is not None and self._topics.odometry is not None and kind == TRANSFORMS
+        # Once the mountings are known, tf has nothing but the odometry. With odometry, no gyro is needed.
+        is_needed = kind != TRANSFORMS or self._topics.odometry is None
+        return self._plan is not None and not (is_needed and (kind != IMU or self.planner.is_without_odometry))
+
+    def _decide_clocks(self, plan: LivePlan) -> None:
+        """Compare the clocks of the odometry and the IMU with that of the scans, by the first messages."""
+        lags_s: dict[type, list[float]] = defaultdict(list)
+        for topic, _, received_ns, early in self._early:
+            item = restamped(early, received_ns, self._clocks[topic].lag_ns)
+            is_other = isinstance(item, OdometryReading) and plan.edge not in (None, (item.odom_frame, item.base_frame))
+            if not is_other and topic not in self._topics.scans[1:]:
+                end_s = item.end if isinstance(item, ScanMessage) else item.stamp
+                lags_s[type(item)].append(received_ns / NANOSECONDS - end_s)
+        self._scan_lags_s = lags_s[ScanMessage]
+        name = self._topics.odometry or "the odometry in tf"
+        self._odometry_ahead_s = self._ahead_s(name, lags_s[OdometryReading])
+        self._imu_ahead_s = self._ahead_s(self._topics.imu or "", lags_s[ImuReading])
+
+    def _ahead_s(self, name: str, lags_s: list[float]) -> float:
+        ahead_s = clock_ahead_s(self._scan_lags_s, lags_s)
+        if ahead_s:
+            self._notify(ahead_note(name, ahead_s))
+        return ahead_s
 
     def _fix(self, topic: str, payload: bytes, received_ns: int) -> Iterator[GnssFix]:
-        if self._plan is None:
-            return
+        """The fixes; they wait for the mountings, and until a few of them show their clock."""
+        number = self._counts[topic]
         try:
-            fix = fix_of(self._codec.decode(payload, FIX), received_ns, self.planner.tree, self.planner.base_frame)
+            content = self._codec.decode(payload, FIX)
         except ValueError:
-            fix = Fault.BROKEN_MESSAGE
-        if isinstance(fix, Fault):
-            self.audit.add(fix, self._counts[topic])
-        else:
-            yield fix
+            self.audit.add(Fault.BROKEN_MESSAGE, number)
+            return
+        self._clocks[topic].note(content.header, received_ns)
+        self._early_fixes.append(_Early(topic, number, received_ns, content))
+        if self._plan is None or (self._fixes is None and len(self._early_fixes) < FEWEST_LAGS):
+            return
+        lag_ns = self._clocks[topic].lag_ns
+        if self._fixes is None:
+            stamps = [
+                (each.received_ns, header_of(each.item.header, each.received_ns - lag_ns)[0])
+                for each in self._early_fixes
+            ]
+            ahead_s = self._ahead_s(topic, [ns / NANOSECONDS - stamp for ns, stamp in stamps])
+            self._fixes = FixReader(self.planner.tree, self.planner.base_frame, ahead_s, self.audit)
+        while self._early_fixes:
+            _, number, came_ns, content = self._early_fixes.popleft()
+            yield from self._fixes.read(number, content, came_ns - lag_ns)
 
-    def _decoded(self, topic: str, payload: bytes, received_ns: int) -> list[Message]:
+    def _decoded(self, topic: str, payload: bytes, received_ns: int) -> list[Item]:
         kind = self._topics.kinds[topic]
         content = self._codec.decode(payload, kind)
+        clock = self._clocks[topic]
+        for each in content.transforms if kind == TRANSFORMS else (content,):
+            clock.note(each.header, received_ns)
+        if clock.unstamped and kind != TRANSFORMS:
+            self._notify(f"{topic} has messages without a stamp; the times at which they arrive count")
+        received_ns -= clock.lag_ns
         if topic in self._topics.scans:
             return self._scan_items(topic, content, received_ns)
         if kind == ODOMETRY:
             reading = odometry_of(content, received_ns)
             self.planner.add_reading(reading)
             return [reading]
+        if kind == IMU:
+            return [imu_of(content, received_ns)]
         if kind in (COMPRESSED_IMAGE, IMAGE):
             return [image_of(content, kind, received_ns)]
         if kind == CAMERA_INFO:
@@ -190,7 +273,7 @@ class LiveSensors:
             return []
         return self._transforms(content, received_ns)
 
-    def _scan_items(self, topic: str, content: object, received_ns: int) -> list[Message]:
+    def _scan_items(self, topic: str, content: Any, received_ns: int) -> list[Item]:
         laser = self._topics.scans.index(topic)
         scan = self._scan(topic, content, received_ns)
         if scan is None:
@@ -206,10 +289,10 @@ class LiveSensors:
             self.audit.add(Fault.OTHER_BEAMS, self._counts[topic])
             return []
         if self._plan is None:
-            self.planner.add_scan(scan)
+            self.planner.add_scan(scan, is_stamped=stamp_ns_of(content.header) > 0)
         return [scan]
 
-    def _scan(self, topic: str, content: object, received_ns: int) -> ScanMessage | None:
+    def _scan(self, topic: str, content: Any, received_ns: int) -> ScanMessage | None:
         """The scan in a message; None while what it needs is awaited. Raises ValueError if the message is invalid."""
         kind, info = self._topics.kinds[topic], info_beside(topic)
         if kind in LASER_SCANS:
@@ -217,22 +300,38 @@ class LiveSensors:
         if kind == IMAGE and info not in self.planner.calibrations:
             self.planner.awaited[topic] = f"waits for the calibration of {topic}: {info} is silent; publish it"
             return None
-        cloud = cloud_of(content, kind, received_ns, self.planner.calibrations.get(info))
+        longest_s = self._longest_cloud_s(topic, *header_of(content.header, received_ns))
+        if longest_s is None:
+            return None
+        cloud = cloud_of(content, kind, received_ns, self.planner.calibrations.get(info), longest_s)
         if self._options.laser_poses:
             pose = self._options.laser_poses[self._topics.scans.index(topic)]
             mounting = given_cloud_mounting(pose, kind, cloud.frame)
         else:
             try:
                 T_base_sensor = self.planner.tree.fixed(self.planner.known_base_frame, cloud.frame)
-                mounting = cloud_mounting(T_base_sensor, kind, cloud.frame)
             except NoTransformError as error:
                 self.planner.awaited[topic] = missing_mounting(error)
                 return None
+            mounting = cloud_mounting(T_base_sensor, kind, cloud.frame)
+            if lacks_optical_frame(T_base_sensor, kind, cloud.frame):
+                self._notify(optical_note(topic, cloud.frame))
         if topic not in self._directions:
+            for note in notes_on_times(topic, kind, [cloud]):
+                self._notify(note)
             self._directions[topic] = directions_in([cloud], mounting)
         return scan_of_cloud(cloud, mounting._replace(directions=self._directions[topic]), self._options.cloud_band)
 
-    def _transforms(self, content: object, received_ns: int) -> list[Message]:
+    def _longest_cloud_s(self, topic: str, stamp: float, frame: str) -> float | None:
+        """The longest time that a cloud takes, by the least time between two of them; None for the first."""
+        if frame == self._frames.get(topic, frame):
+            elapsed_s = stamp - self._cloud_stamps.get(topic, stamp)
+            self._cloud_stamps[topic] = stamp
+            if elapsed_s > 0.0:
+                self._intervals_s[topic] = min(elapsed_s, self._intervals_s.get(topic, inf))
+        return longest_cloud_s(self._intervals_s[topic]) if topic in self._intervals_s else None
+
+    def _transforms(self, content: Any, received_ns: int) -> list[Item]:
         transforms = list(transforms_of(content, received_ns))
         if self._plan is None:
             self.planner.add_transforms(transforms)
@@ -240,11 +339,17 @@ class LiveSensors:
             return []
         return [odometry_in(each) for each in transforms]
 
-    def _read(self, reader: SensorReader, number: int, item: Message) -> Iterator[SensorRecord]:
+    def _read(self, reader: SensorReader, number: int, item: Item) -> Iterator[SensorRecord]:
         plan = self._plan
         assert plan is not None  # nothing is read before
-        if isinstance(item, OdometryReading) and plan.edge not in (None, (item.odom_frame, item.base_frame)):
+        if isinstance(item, ImuReading):
+            self._axes = self._axes or ImuAxes(self.planner.tree, self.planner.base_frame)
+            yield from self._recorded(reader.turn(*self._axes.turn(item, self._imu_ahead_s)))
             return
+        if isinstance(item, OdometryReading):
+            if plan.edge not in (None, (item.odom_frame, item.base_frame)):
+                return
+            item = item._replace(stamp=item.stamp - self._odometry_ahead_s)
         if isinstance(item, ScanMessage):
             if self._has_stepped_back(item.stamp):
                 reader = self._reader = self._new_reader(plan)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from fcslam.errors import InputError, SourceError
 from fcslam.ros.network import Endpoint, published
-from fcslam.sources.bags.codec import FIX, IMAGE, ODOMETRY, TRANSFORMS
+from fcslam.sources.bags.codec import FIX, IMAGE, IMU, ODOMETRY, TRANSFORMS
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.topics import KnownTopics, calibration_beside, choose_topics
@@ -28,6 +28,7 @@ class SensorTopics:
     fixes: str | None = None
     """Of satellite navigation."""
     notes: tuple[str, ...] = ()
+    imu: str | None = None
 
 
 def resolved(namespace: str, name: str) -> str:
@@ -38,7 +39,8 @@ def resolved(namespace: str, name: str) -> str:
 def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options: BagOptions) -> SensorTopics:
     """Choose the topics to read in ``namespace``, by the rules for bags; nobody knows the fields of view.
 
-    Fixes of satellite navigation are those of the topic that is first by name. The topics of tf are the namespace's own
+    Fixes of satellite navigation are those of the topic that is first by name, and so are the readings of an IMU, which
+    are read if no topic has odometry. The topics of tf are the namespace's own
     if there is one, else that of all robots.
     """
     known = published(endpoints)
@@ -68,7 +70,8 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
     transforms = list(dict.fromkeys((*(topic for topic in chosen.odometry if topic != odometry), *transforms)))
     depth_infos = [calibration_beside(topic, every) for topic in chosen.scans if topic.type == IMAGE]
     fixes = min((topic for topic in inside if topic.type == FIX), default=None)
-    read = (*chosen.scans, *depth_infos, *transforms, odometry, chosen.camera, chosen.camera_info, fixes)
+    imu = None if odometry else min((topic for topic in inside if topic.type == IMU), default=None)
+    read = (*chosen.scans, *depth_infos, *transforms, odometry, chosen.camera, chosen.camera_info, fixes, imu)
     return SensorTopics(
         {topic.name: topic.type for topic in read if topic is not None},
         _names(chosen.scans),
@@ -78,6 +81,7 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
         chosen.camera_info and chosen.camera_info.name,
         fixes and fixes.name,
         chosen.notes,
+        imu and imu.name,
     )
 
 

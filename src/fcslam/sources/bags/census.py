@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
 from fcslam.records import Beams, Sweep, Transform
+from fcslam.sources.bags.clocks import StampClock, restamped
 from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -29,7 +30,6 @@ from fcslam.sources.bags.codec import (
     IMAGE,
     IMU,
     LASER_SCANS,
-    NANOSECONDS,
     ODOMETRY,
     OLD_TRANSFORMS,
     SCANS,
@@ -45,11 +45,11 @@ from fcslam.sources.bags.messages import (
     header_of,
     odometry_of,
     scan_of,
-    stamp_ns_of,
     transforms_of,
 )
 from fcslam.sources.bags.records import MessagePlace, StoredMessage
 from fcslam.sources.bags.transforms import Link, TransformTree, difference
+from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.untrusted import ZSTD, LimitError, unpack
 
 _LATEST_NS: Final = int(np.iinfo(np.int64).max)
@@ -57,6 +57,8 @@ _LATEST_NS: Final = int(np.iinfo(np.int64).max)
 _ROWS_AT_ONCE: Final = 256
 _KEPT: Final = (*LASER_SCANS, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
 _COUNTED: Final = (*SCANS, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
+_CLOCKED: Final = (FIX, IMU)
+"""Types of which only the stamps of the first messages are looked at."""
 _READ: Final = (*_COUNTED, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, FIX, IMU)
 
 
@@ -77,10 +79,7 @@ class TopicCensus:
     """Transforms of tf from a parent to a child: the first, and the first ones that differ from it in each way."""
     odom_frames: set[str] = field(default_factory=set)
     """Parent frames of odometry."""
-    lags_s: "array[float]" = field(default_factory=lambda: array("d"))
-    """Times from the stamps of messages to their recording."""
-    unstamped: int = 0
-    """Messages with a stamp of zero."""
+    clock: StampClock = field(default_factory=StampClock)
     broken: int = 0
     """Messages that are invalid."""
     first_broken: int = 0
@@ -92,22 +91,13 @@ class TopicCensus:
         first_ns, last_ns = self.span_ns if self.count else (time_ns, time_ns)
         self.count, self.span_ns = self.count + 1, (min(first_ns, time_ns), max(last_ns, time_ns))
 
-    @cached_property
-    def lag_ns(self) -> int:
-        """Time of recording less the clock of the stamps that are set, for messages without one; whole milliseconds."""
-        return round(1e3 * float(np.median(self.lags_s))) * 10**6 if self.unstamped and self.lags_s else 0
-
-    def _note_stamp(self, header: Any, now_ns: int) -> None:
-        if stamp_ns := stamp_ns_of(header):
-            self.lags_s.append((now_ns - stamp_ns) / NANOSECONDS)
-        else:
-            self.unstamped += 1
-
     def converted(self, message: StoredMessage, content: Any) -> Content | None:
-        """Convert an object of rosbags; None for a point cloud. Raises ValueError if it is invalid."""
+        """Convert an object of rosbags; None if it is not kept. Raises ValueError if it is invalid."""
         now_ns = message.time_ns
-        if message.kind in (*SCANS, ODOMETRY):
-            self._note_stamp(content.header, now_ns)
+        if message.kind in (*SCANS, ODOMETRY, *_CLOCKED):
+            self.clock.note(content.header, now_ns)
+        if message.kind in _CLOCKED:
+            return None
         if message.kind in SCANS:
             self.frames[header_of(content.header, now_ns)[1]] += 1
             return scan_of(content, now_ns) if message.kind in LASER_SCANS else None
@@ -118,7 +108,7 @@ class TopicCensus:
             return reading
         transforms = list(transforms_of(content, now_ns))
         for entry in content.transforms:
-            self._note_stamp(entry.header, now_ns)
+            self.clock.note(entry.header, now_ns)
         for _, parent, child, transform in transforms:
             seen = self.links.setdefault((parent, child), [transform])
             if difference(seen[0], transform) >= len(seen):
@@ -188,6 +178,7 @@ class DecodedBag:
         """The messages of ``topics`` in the order of recording."""
         parts, census, rows, tape = self._index
         by_number = {census[topic].number: topic for topic in topics}
+        lags_ns = {number: census[topic].clock.lag_ns for number, topic in by_number.items()}
         counts: Counter[Topic] = Counter()
         with ExitStack() as opened:
             payloads: dict[int, Callable[[MessagePlace], bytes]] = {}
@@ -197,11 +188,8 @@ class DecodedBag:
                     topic = by_number[number]
                     counts[topic] += 1
                     decoded: Any
-                    lag_ns = census[topic].lag_ns
                     if topic.type in _KEPT:
-                        decoded = _unpacked(os.pread(tape, size, offset))
-                        if lag_ns:
-                            decoded = _restamped(decoded, time_ns, lag_ns)
+                        decoded = restamped(_unpacked(os.pread(tape, size, offset)), time_ns, lags_ns[number])
                     else:
                         with parts[at].translated():
                             if at not in payloads:
@@ -211,7 +199,7 @@ class DecodedBag:
                             decoded = _decode(payload, topic.type, parts[at].file.ros1)
                         except ValueError as error:
                             decoded = error
-                    yield BagMessage(topic, counts[topic], time_ns, time_ns - lag_ns, decoded)
+                    yield BagMessage(topic, counts[topic], time_ns, time_ns - lags_ns[number], decoded)
 
     @cached_property
     def _index(self) -> tuple[tuple[BagPart, ...], dict[Topic, TopicCensus], NDArray[np.int64], int]:
@@ -235,7 +223,7 @@ class DecodedBag:
                     topic.add(time_ns)
                     if message.kind not in _READ:
                         continue
-                    if message.kind in _COUNTED:
+                    if message.kind in _COUNTED or (message.kind in _CLOCKED and topic.count <= FIRST_MESSAGES):
                         content = _counted(topic, message, part.file.ros1)
                         if content is not None and message.kind in _KEPT:
                             size = tape.write(_packed(content))
@@ -290,15 +278,6 @@ def _decode(payload: bytes, kind: str, ros1: bool) -> Any:
         except LimitError as error:
             raise ValueError(str(error)) from error
     return MessageCodec(ros1).decode(payload, kind)
-
-
-def _restamped(content: Any, time_ns: int, lag_ns: int) -> Any:
-    """The content of a topic by one clock: a stamp that is the time of recording was zero."""
-    if isinstance(content, list):
-        return [_restamped(each, time_ns, lag_ns) for each in content]
-    if isinstance(content, ValueError) or content.stamp != time_ns / NANOSECONDS:
-        return content
-    return content._replace(stamp=(time_ns - lag_ns) / NANOSECONDS)
 
 
 def _packed(content: Content) -> bytes:

@@ -8,10 +8,18 @@ from typing import TypeVar
 from fcslam.errors import SourceError
 from fcslam.sources.bags.camera import Calibration, calibration_of
 from fcslam.sources.bags.census import BagMessage
-from fcslam.sources.bags.clouds import cloud_mounting, cloud_of, given_cloud_mounting, lacks_optical_frame
-from fcslam.sources.bags.codec import IMAGE, LASER_SCANS, NANOSECONDS, SCANS
+from fcslam.sources.bags.clouds import (
+    cloud_mounting,
+    cloud_of,
+    given_cloud_mounting,
+    lacks_optical_frame,
+    longest_cloud_s,
+    notes_on_times,
+    optical_note,
+)
+from fcslam.sources.bags.codec import IMAGE, LASER_SCANS, NANOSECONDS
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.messages import LONGEST_SWEEP_S, ScanMessage
+from fcslam.sources.bags.messages import ScanMessage
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.topics import calibration_beside
@@ -21,8 +29,6 @@ from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud, di
 
 _CLOUDS_TRIED = 10 * FIRST_MESSAGES
 """First clouds over which those are spread that show the floor and the directions of the sensor."""
-_OVER_INTERVAL = 1.2
-"""Largest ratio of the duration of a cloud to the mean time between two clouds."""
 
 Found = TypeVar("Found")
 
@@ -81,7 +87,7 @@ class BagScans:
             clouds = list(self._some_clouds(topic, frame))
             mounting = self._levelled(topic, clouds, self._mounting(topic, frame))
             self._mountings[topic, frame] = mounting._replace(directions=directions_in(clouds, mounting))
-            self.notes += [f"{self._robot.bag.path}: {note}" for note in _notes_on_times(topic, clouds)]
+            self.notes += [f"{self._robot.bag.path}: {note}" for note in notes_on_times(topic.name, topic.type, clouds)]
         return self._mountings[topic, frame]
 
     def cloud(self, message: BagMessage) -> PointCloud:
@@ -93,7 +99,7 @@ class BagScans:
         its = self._robot.bag.census[topic]
         first_ns, last_ns = its.span_ns
         interval_s = len(its.frames) * (last_ns - first_ns) / (max(1, its.count - 1) * NANOSECONDS)
-        longest_s = min(_OVER_INTERVAL * interval_s, LONGEST_SWEEP_S) or LONGEST_SWEEP_S
+        longest_s = longest_cloud_s(interval_s)
         return cloud_of(message.content, topic.type, message.unstamped_ns, self._calibrations[topic], longest_s)
 
     def _mounting(self, topic: Topic, frame: str) -> CloudMounting:
@@ -114,10 +120,7 @@ class BagScans:
                 "with --sensors laser-pose=X,Y,THETA (metres, radians)"
             ) from error
         if lacks_optical_frame(T_base_sensor, topic.type, frame):
-            self.notes.append(
-                f"{path}: by tf, the camera of {topic.name} looks up, so '{frame}' is not its optical frame; "
-                "corrected: publish a frame with roll -90 and yaw -90 deg in it, and name that in the images"
-            )
+            self.notes.append(f"{path}: {optical_note(topic.name, frame)}")
         return cloud_mounting(T_base_sensor, topic.type, frame)
 
     def _levelled(self, topic: Topic, clouds: list[PointCloud], mounting: CloudMounting) -> CloudMounting:
@@ -134,17 +137,3 @@ class BagScans:
         step = max(1, min(topic.message_count, _CLOUDS_TRIED) // FIRST_MESSAGES)
         clouds = valid(islice(self._robot.bag.read([topic]), 0, _CLOUDS_TRIED, step), self.cloud)
         return (cloud for cloud in clouds if cloud.frame == frame)
-
-
-def _notes_on_times(topic: Topic, clouds: list[PointCloud]) -> Iterator[str]:
-    left_out = sum(cloud.left_out for cloud in clouds)
-    if left_out:
-        share = left_out / (left_out + sum(len(cloud.points) for cloud in clouds))
-        yield f"{share:.1%} of the points of {topic.name} are left out, as their times are far from those of the others"
-    if topic.type in SCANS and not any(len(cloud.times_s) for cloud in clouds):
-        is_in_order = any(cloud.is_in_order for cloud in clouds)
-        times = "times that are no seconds and count as their order" if is_in_order else "no times, or all the same"
-        yield (
-            f"the points of {topic.name} have {times}, so the motion of the robot during a cloud is corrected only if "
-            "the drive shows how the sensor turns; let the driver publish them"
-        )

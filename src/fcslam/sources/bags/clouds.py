@@ -1,5 +1,6 @@
 """Point clouds and depth images of a bag or a live robot as scans; invalid messages raise ValueError."""
 
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -20,6 +21,10 @@ TIMES: Final = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_off
 _UNITS_S: Final = (1.0, 1e-3, 1e-6, 1e-9)
 _SHORTEST_CLOUD_S: Final = 5e-3
 """Least time between the first and the last point of a cloud; it shows the unit of the times."""
+_OVER_INTERVAL: Final = 1.2
+"""Largest ratio of the duration of a cloud to the time between two clouds."""
+_LONGEST_IN_SECONDS: Final = 0.9
+"""Times of points that are seconds span less: from 0 to 1 they are shares of a turn."""
 _BULK: Final = 0.5
 """Share of the points of a cloud, in the middle of all times, that show the unit."""
 _REACH: Final = 4.0
@@ -44,6 +49,14 @@ def cloud_mounting(T_base_sensor: Transform, kind: str, frame: str) -> CloudMoun
 def lacks_optical_frame(T_base_sensor: Transform, kind: str, frame: str) -> bool:
     """Whether depth images are in a frame of the camera's body: its z axis, along which they look, points up."""
     return kind == IMAGE and "optical" not in frame and bool(T_base_sensor.rotation_matrix()[2, 2] > _UP)
+
+
+def optical_note(topic: str, frame: str) -> str:
+    """The notice about a camera that looks up by tf."""
+    return (
+        f"by tf, the camera of {topic} looks up, so '{frame}' is not its optical frame; corrected: publish a frame "
+        "with roll -90 and yaw -90 deg in it, and name that in the images"
+    )
 
 
 def given_cloud_mounting(pose: GivenPose, kind: str, frame: str) -> CloudMounting:
@@ -123,6 +136,26 @@ def _fields(content: Any) -> tuple[FloatArray, Any]:
     return points, values[name].astype(np.float64 if types[name][0].kind == "f" else np.int64)
 
 
+def longest_cloud_s(interval_s: float) -> float:
+    """The longest time that a cloud takes, given that between two clouds; 0: it is not known."""
+    return min(_OVER_INTERVAL * interval_s, LONGEST_SWEEP_S) or LONGEST_SWEEP_S
+
+
+def notes_on_times(topic: str, kind: str, clouds: Sequence[PointCloud]) -> Iterator[str]:
+    """What is wrong with the times of the points in these clouds."""
+    left_out = sum(cloud.left_out for cloud in clouds)
+    if left_out:
+        share = left_out / (left_out + sum(len(cloud.points) for cloud in clouds))
+        yield f"{share:.1%} of the points of {topic} are left out, as their times are far from those of the others"
+    if kind != IMAGE and not any(len(cloud.times_s) for cloud in clouds):
+        is_in_order = any(cloud.is_in_order for cloud in clouds)
+        times = "times that are no seconds and count as their order" if is_in_order else "no times, or all the same"
+        yield (
+            f"the points of {topic} have {times}, so the motion of the robot during a cloud is corrected only if a "
+            "recording shows how the sensor turns; let the driver publish them"
+        )
+
+
 def timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
     """The cloud with the times of its points, of any usual unit and beginning; points with wrong times are left out.
 
@@ -139,7 +172,8 @@ def timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
     points, times, after = cloud.points[is_near], times[is_near], after[is_near]
     cloud = cloud._replace(points=points, left_out=int(np.count_nonzero(~is_near)))
     for unit_s in _UNITS_S:
-        if _SHORTEST_CLOUD_S <= (high - low) / _BULK * unit_s <= longest_s:
+        most_s = min(longest_s, _LONGEST_IN_SECONDS) if unit_s == 1.0 else longest_s
+        if _SHORTEST_CLOUD_S <= (high - low) / _BULK * unit_s <= most_s:
             break
     else:
         return cloud._replace(points=points[np.argsort(after, kind="stable")], is_in_order=True)

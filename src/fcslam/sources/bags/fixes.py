@@ -1,6 +1,8 @@
 """The fixes of a satellite receiver in a bag: sensor_msgs/NavSatFix."""
 
 import math
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, Final
 
 from fcslam.records import GnssFix
@@ -9,7 +11,7 @@ from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import header_of
 from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, mounting
-from fcslam.sources.faults import Fault
+from fcslam.sources.faults import Audit, Fault
 
 SIGMA_M: Final = {0: 5.0, 1: 2.0, 2: 0.5}
 """Standard deviations of fixes with an unknown covariance, by status: alone, with corrections by satellite, by ground
@@ -27,6 +29,30 @@ def fix_topics(robot: BagRobot) -> list[Topic]:
     """The topics of fixes of a robot, the one with most messages first."""
     topics = [topic for topic in robot.topics if topic.type == FIX and topic.message_count]
     return sorted(topics, key=lambda topic: (-topic.message_count, topic.name))
+
+
+class FixReader:
+    """Turns the messages of a receiver into fixes, by the clock of the scans."""
+
+    def __init__(self, tree: TransformTree, base_frame: str, ahead_s: float, audit: Audit) -> None:
+        """The clock of the fixes is ``ahead_s`` ahead; ``audit`` counts the faults."""
+        self._tree, self._base_frame, self._ahead_s, self._audit = tree, base_frame, ahead_s, audit
+        self._used_s = -math.inf
+
+    def read(self, number: int, content: Any, unstamped_ns: int) -> Iterator[GnssFix]:
+        """The fix in the next message, if there is one; it is left out if it comes soon after the one before."""
+        try:
+            found = fix_of(content, unstamped_ns, self._tree, self._base_frame)
+        except ValueError:
+            found = Fault.BROKEN_MESSAGE
+        if isinstance(found, Fault):
+            self._audit.add(found, number)
+            return
+        if content.status.status < NO_FIX:
+            self._audit.add(Fault.UNKNOWN_FIX, number)
+        if abs(found.stamp - self._used_s) >= FIX_INTERVAL_S:
+            self._used_s = found.stamp
+            yield replace(found, stamp=found.stamp - self._ahead_s)
 
 
 def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str) -> GnssFix | Fault:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
+from fcslam.records import FloatArray
 from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage
 from fcslam.sources.faults import Fault
@@ -39,6 +40,8 @@ class PosedScan(NamedTuple):
     T_odom_base: Pose
     fault: Fault | None
     """Fault of the pose; with NO_ODOMETRY the pose is the identity."""
+    gyro: FloatArray | None = None
+    """Readings of a gyro since the scan before, as in ``LaserScan``."""
 
 
 class PosedImage(NamedTuple):

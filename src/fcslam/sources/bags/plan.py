@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from itertools import chain, islice
 from math import degrees, tau
-from statistics import quantiles
 from typing import NamedTuple
 
 from fcslam.config import one_line
@@ -12,10 +11,12 @@ from fcslam.errors import SourceError
 from fcslam.records import Sweep
 from fcslam.sources.bags.camera import Calibration, image_of
 from fcslam.sources.bags.census import BagMessage
+from fcslam.sources.bags.clocks import ahead_note, clock_ahead_s
 from fcslam.sources.bags.cloud_scans import BagScans, calibration_in, valid
 from fcslam.sources.bags.codec import LASER_SCANS, ODOMETRY
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.fixes import fix_topics
+from fcslam.sources.bags.imu import imu_topics
 from fcslam.sources.bags.messages import OdometryReading, header_of, odometry_in
 from fcslam.sources.bags.options import NO_ODOMETRY, BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Message
@@ -25,13 +26,12 @@ from fcslam.sources.bags.sectors import cloud_sector_rad
 from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree, is_corrected
 from fcslam.sources.contradictions import CHANGED, changed_share
-from fcslam.sources.gate import FIRST_MESSAGES, MAX_STEP_BACK_S
+from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
 from fcslam.sources.point_clouds import CloudBand
 
 _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
-_FEWEST_LAGS = 4
 
 
 class OdometryInput(NamedTuple):
@@ -69,6 +69,8 @@ class BagPlan(NamedTuple):
     """The clock of the odometry against that of the scans."""
     fixes_ahead_s: float
     """The same of the fixes."""
+    imu_ahead_s: float
+    """The same of the IMU of a robot without odometry."""
     calibration: Calibration | None
     """Of the camera; None without a camera or a readable calibration."""
     odometry_notes: tuple[str, ...]
@@ -127,17 +129,18 @@ class _Planner:
             for frame in self._robot.scan_frames.get(topic.name, (None,))
         )
         odometry = self._odometry(lasers[0].first.frame)
-        ahead_s = fixes_ahead_s = 0.0
+        ahead_s = fixes_ahead_s = imu_ahead_s = 0.0
         if odometry is not None:
             readings, read = odometry.readings, odometry.topics
             ahead_s = self._ahead_s(odometry.name, read, lambda message: [each.stamp for each in readings(message)])
         for fixes in fix_topics(self._robot)[:1]:
-            fixes_ahead_s = self._ahead_s(
-                fixes.name, [fixes], lambda message: [header_of(message.content.header, message.unstamped_ns)[0]]
-            )
+            fixes_ahead_s = self._ahead_s(fixes.name, [fixes], _stamp_of)
+        for imu in imu_topics(self._robot)[:1] if odometry is None else ():
+            imu_ahead_s = self._ahead_s(imu.name, [imu], _stamp_of)
         calibration = calibration_in(self._robot, topics.camera_info)
         notes = tuple(self._notes)
-        return BagPlan(topics, self._tree, self._scans, lasers, odometry, ahead_s, fixes_ahead_s, calibration, notes)
+        clocks_s = ahead_s, fixes_ahead_s, imu_ahead_s
+        return BagPlan(topics, self._tree, self._scans, lasers, odometry, *clocks_s, calibration, notes)
 
     def _laser(self, topic: Topic, frame: str | None) -> RecordedLaser:
         own = (scan for scan in self._scans.of(topic) if frame in (None, scan.frame))
@@ -234,31 +237,23 @@ class _Planner:
 
     def _ahead_s(self, name: str, topics: Sequence[Topic], stamps_of: Callable[[BagMessage], list[float]]) -> float:
         """How far the clock of these topics is ahead of that of the scans."""
-        lag_s = self._lag_s(topics, stamps_of)
-        if lag_s is None or self._scans_lag_s is None or abs(self._scans_lag_s - lag_s) < MAX_STEP_BACK_S:
-            return 0.0
-        self._notes.append(
-            f"{self._path}: the clock of {name} is {self._scans_lag_s - lag_s:.3f} s ahead of that of the scans by the "
-            "times of recording; corrected"
-        )
-        return self._scans_lag_s - lag_s
+        ahead_s = clock_ahead_s(self._scans_lags_s, self._lags_s(topics, stamps_of))
+        if ahead_s:
+            self._notes.append(f"{self._path}: {ahead_note(name, ahead_s)}")
+        return ahead_s
 
     @cached_property
-    def _scans_lag_s(self) -> float | None:
+    def _scans_lags_s(self) -> list[float]:
         band = self._options.cloud_band
-        return self._lag_s(self._topics.scans[:1], lambda message: [self._scans.scan(message, band).end])
+        return self._lags_s(self._topics.scans[:1], lambda message: [self._scans.scan(message, band).end])
 
-    def _lag_s(self, topics: Sequence[Topic], ends_of: Callable[[BagMessage], list[float]]) -> float | None:
-        """Usual time from the measurement to the recording of a message; None if it varies, or there are too few."""
-        lags_s = [
+    def _lags_s(self, topics: Sequence[Topic], ends_of: Callable[[BagMessage], list[float]]) -> list[float]:
+        """Times from the measurement to the recording of the first messages."""
+        return [
             message.bag_time_ns / 1e9 - end_s
             for message in islice(self._bag.read(topics), FIRST_MESSAGES)
             for end_s in chain.from_iterable(valid([message], ends_of))
         ]
-        if len(lags_s) < _FEWEST_LAGS:
-            return None
-        low_s, middle_s, high_s = quantiles(lags_s, n=4)
-        return middle_s if high_s - low_s <= MAX_STEP_BACK_S else None
 
     def _jumps(self, topic: Topic) -> bool:
         frames = self._bag.census[topic].odom_frames
@@ -269,3 +264,7 @@ class _Planner:
             return tau
         scan = next(valid(self._bag.read([topic]), lambda message: message.content), None)
         return 0.0 if scan is None else scan.beams.span_rad
+
+
+def _stamp_of(message: BagMessage) -> list[float]:
+    return [header_of(message.content.header, message.unstamped_ns)[0]]

@@ -74,7 +74,7 @@ class Rig(NamedTuple):
         ranges_m = frozen(ranges_m[::-1] if upside_down else ranges_m, np.float32)
         laser = self.lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
         sweep = reversed_sweep(scan.sweep) if upside_down else scan.sweep
-        return LaserScan(scan.stamp, ranges_m, laser, frozen(posed.T_odom_base), sweep)
+        return LaserScan(scan.stamp, ranges_m, laser, frozen(posed.T_odom_base), sweep, gyro=posed.gyro)
 
     def widened(self, scan: ScanMessage) -> "Rig":
         """The rig in which a laser whose range_max grows has none of its own: that of each message counts."""

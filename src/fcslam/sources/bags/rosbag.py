@@ -5,22 +5,20 @@ counted. A robot that stands still is accepted, because a topic shows that there
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain, repeat
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from fcslam.errors import InputError, SourceError
 from fcslam.geometry import se2
-from fcslam.records import FloatArray, GnssFix, Odometry, SensorRecord, frozen
+from fcslam.records import GnssFix, Odometry, SensorRecord, frozen
 from fcslam.sources.bags.census import DecodedBag
 from fcslam.sources.bags.cloud_scans import valid
 from fcslam.sources.bags.container import is_transforms
-from fcslam.sources.bags.fixes import FIX_INTERVAL_S, NO_FIX, fix_of, fix_topics
+from fcslam.sources.bags.fixes import FixReader, fix_topics
 from fcslam.sources.bags.imu import ImuAxes, imu_of, imu_topics
 from fcslam.sources.bags.messages import OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
@@ -41,8 +39,6 @@ from fcslam.sources.source import WHOLE, ScanRange, Survey
 _audit = partial(Audit, "message")
 _EACH_LASER = "give one for each laser, in the same order"
 
-_AFTER_S = 0.02
-"""Readings of a gyro so long after a scan show its end."""
 _OF_SCANS = "its range_min and range_max"
 _OF_CLOUDS = "that its points are in metres, its mounting in tf and the heights of --sensors cloud-band"
 
@@ -116,19 +112,14 @@ class RosBag:
         rig, placeholders = self._reading.rig, self._reading.placeholders
         correction = self.options.correction
         floors = [floor and floor.mirrored() if correction.upside_down else floor for floor in correction.floors]
-        gyro, before_s = self._gyro, -np.inf
         found, faults = self._fixes
         fixes = deque(found)
         for kind, fault in faults.counts.items():
             audit.add(kind, fault.first_line, fault.count)
-        entries = self._entries(audit, self._reading.band, with_images=rig.camera is not None)
+        entries = self._entries(audit, self._reading.band, with_images=rig.camera is not None, turns=self._turns)
         for number, entry in scan_window(entries, scans, _is_scan, audit):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
-                if len(gyro):
-                    end_s = entry.scan.end + _AFTER_S
-                    read, rest = np.searchsorted(gyro[:, 0], (before_s, end_s))
-                    record, before_s = replace(record, gyro=frozen(gyro[read:rest])), end_s
                 while fixes and fixes[0].stamp <= record.stamp:
                     yield fixes.popleft()
                 if values := placeholders[entry.scan.laser]:
@@ -146,41 +137,33 @@ class RosBag:
                     audit.add(Fault.BROKEN_IMAGE, number)
 
     @cached_property
-    def _gyro(self) -> FloatArray:
-        """Readings of the gyro about the vertical, shape (K, 2), of a robot without odometry."""
+    def _turns(self) -> list[tuple[float, float]]:
+        """Angular velocities about the vertical by the gyro of a robot without odometry, with their stamps."""
         if self.plan.odometry is not None:
-            return np.zeros((0, 2))
+            return []
         axes = ImuAxes(self.plan.tree, self._reading.base_frame)
         messages = self.bag.read(imu_topics(self.robot)[:1])
-        rows = [axes.row(each) for each in valid(messages, lambda each: imu_of(each.content, each.bag_time_ns))]
-        readings: FloatArray = np.array(rows).reshape(-1, 7)[:, [0, 3]]
-        return readings[np.argsort(readings[:, 0], kind="stable")]
+        readings = valid(messages, lambda each: imu_of(each.content, each.unstamped_ns))
+        return sorted(axes.turn(each, self.plan.imu_ahead_s) for each in readings)
 
     @cached_property
     def _fixes(self) -> tuple[tuple[GnssFix, ...], Faults]:
-        audit, found = _audit(), list[GnssFix]()
-        for message in self.bag.read(fix_topics(self.robot)[:1]):
-            try:
-                fix = fix_of(message.content, message.unstamped_ns, self.plan.tree, self._reading.base_frame)
-            except ValueError:
-                fix = Fault.BROKEN_MESSAGE
-            if isinstance(fix, Fault):
-                audit.add(fix, message.number)
-                continue
-            if message.content.status.status < NO_FIX:
-                audit.add(Fault.UNKNOWN_FIX, message.number)
-            found.append(replace(fix, stamp=fix.stamp - self.plan.fixes_ahead_s))
-        apart: list[GnssFix] = []
-        for fix in sorted(found, key=lambda fix: fix.stamp):
-            if not apart or fix.stamp >= apart[-1].stamp + FIX_INTERVAL_S:
-                apart.append(fix)
-        return tuple(apart), audit.faults()
+        audit, plan = _audit(), self.plan
+        reader = FixReader(plan.tree, self._reading.base_frame, plan.fixes_ahead_s, audit)
+        messages = self.bag.read(fix_topics(self.robot)[:1])
+        found = chain.from_iterable(reader.read(each.number, each.decoded, each.unstamped_ns) for each in messages)
+        return tuple(sorted(found, key=lambda fix: fix.stamp)), audit.faults()
 
     def _entries(
-        self, audit: Audit, band: CloudBand, errors: dict[str, str] | None = None, with_images: bool = False
+        self,
+        audit: Audit,
+        band: CloudBand,
+        errors: dict[str, str] | None = None,
+        with_images: bool = False,
+        turns: Iterable[tuple[float, float]] = (),
     ) -> Iterator[Numbered]:
         plan, errors = self.plan, {} if errors is None else errors
-        reader = SensorReader(plan.lasers, plan.odometry is not None, audit)
+        reader = SensorReader(plan.lasers, plan.odometry is not None, audit, turns)
         for message in self.bag.read(plan.read_topics(with_images)):
             try:
                 items = plan.items(message, band, self.options.correction)
@@ -244,10 +227,10 @@ class RosBag:
         notes = [
             *self.bag.notes,
             *(
-                f"{self.path}: {its.unstamped} of {its.count} messages of {topic.name} have no stamp; their times of "
-                "recording count"
+                f"{self.path}: {its.clock.unstamped} of {its.count} messages of {topic.name} have no stamp; their "
+                "times of recording count"
                 for topic, its in self.bag.census.items()
-                if topic in plan.read_topics(with_images=False) and not is_transforms(topic) and its.unstamped > 1
+                if topic in plan.read_topics(with_images=False) and not is_transforms(topic) and its.clock.unstamped > 1
             ),
             *chain.from_iterable(laser.notes(self.path, self.options.cloud_band) for laser in lasers),
             *plan.scans.notes,

@@ -1,0 +1,64 @@
+"""The clocks of a robot's stamps, by the times at which messages are recorded, or arrive."""
+
+from array import array
+from collections.abc import Sequence
+from statistics import median, quantiles
+from typing import Any
+
+from fcslam.sources.bags.codec import NANOSECONDS
+from fcslam.sources.bags.messages import stamp_ns_of
+from fcslam.sources.gate import FIRST_MESSAGES, MAX_STEP_BACK_S
+
+FEWEST_LAGS = 4
+
+
+class StampClock:
+    """The clock of the stamps of one topic: messages without a stamp are read by it."""
+
+    def __init__(self) -> None:
+        self.unstamped = 0
+        """Messages with a stamp of zero."""
+        self._lags_s = array("d")
+
+    def note(self, header: Any, now_ns: int) -> None:
+        """Take the header of the next message, which is recorded at ``now_ns``."""
+        stamp_ns = stamp_ns_of(header)
+        self.unstamped += not stamp_ns
+        if stamp_ns and len(self._lags_s) < FIRST_MESSAGES:
+            self._lags_s.append((now_ns - stamp_ns) / NANOSECONDS)
+
+    @property
+    def lag_ns(self) -> int:
+        """Time of recording less the clock of the stamps that are set, in whole milliseconds; 0 if none is missing."""
+        return round(1e3 * median(self._lags_s)) * 10**6 if self.unstamped and self._lags_s else 0
+
+
+def restamped(content: Any, now_ns: int, lag_ns: int) -> Any:
+    """The content of a message by the clock of its topic: a stamp that is the time of recording was zero."""
+    if isinstance(content, list):
+        return [restamped(each, now_ns, lag_ns) for each in content]
+    if not lag_ns or isinstance(content, ValueError) or content.stamp != now_ns / NANOSECONDS:
+        return content
+    return content._replace(stamp=(now_ns - lag_ns) / NANOSECONDS)
+
+
+def clock_ahead_s(scans_s: Sequence[float], others_s: Sequence[float]) -> float:
+    """How far a clock is ahead of that of the scans, by the times from measuring to recording with both.
+
+    It is 0 if they differ by little, if one varies, or if there are too few.
+    """
+    usual_s = []
+    for lags_s in (scans_s, others_s):
+        if len(lags_s) < FEWEST_LAGS:
+            return 0.0
+        low_s, middle_s, high_s = quantiles(lags_s, n=4)
+        if high_s - low_s > MAX_STEP_BACK_S:
+            return 0.0
+        usual_s.append(middle_s)
+    ahead_s = usual_s[0] - usual_s[1]
+    return ahead_s if abs(ahead_s) >= MAX_STEP_BACK_S else 0.0
+
+
+def ahead_note(name: str, ahead_s: float) -> str:
+    """The notice about a clock that is ahead."""
+    return f"the clock of {name} is {ahead_s:.3f} s ahead of that of the scans by the times of recording; corrected"
