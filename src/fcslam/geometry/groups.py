@@ -38,6 +38,12 @@ class Group(NamedTuple):
     """x, y and heading, shape (..., 3)."""
     from_plane: Callable[[Any], _Array]
     """The pose of x, y and heading, level at height 0."""
+    planar_information: Callable[[Any], _Array]
+    """Information (..., 3, 3) of x, y and heading, whatever the others are, of an information (..., d, d)."""
+    shift_m: Callable[[Any], Any]
+    """Length of the translation of a motion (..., P), metres, shape (...)."""
+    turn_rad: Callable[[Any], Any]
+    """Angle of the rotation of a motion (..., P), radians, shape (...)."""
 
     @property
     def axes(self) -> int:
@@ -66,24 +72,9 @@ class Group(NamedTuple):
         """``x exp(d)`` of poses x and a step d, shape (N, d)."""
         return self.compose(poses, self.exp(step))
 
-    def planar_information(self, information: _Array) -> _Array:
-        """Information (..., 3, 3) of x, y and heading, whatever the others are, of an information (..., d, d)."""
-        if self.freedom == 3:
-            return information
-        covariance = np.linalg.inv(information)[..., [[0], [1], [5]], [0, 1, 5]]
-        return np.asarray(np.linalg.inv(covariance), np.float64)
 
-    def shift_m(self, T: _Array) -> Any:
-        """Length of the translation of a motion (..., P), metres, shape (...)."""
-        return np.hypot(T[..., 0], T[..., 1]) if self.freedom == 3 else np.linalg.norm(T[..., :3], axis=-1)
-
-    def turn_rad(self, T: _Array) -> Any:
-        """Angle of the rotation of a motion (..., P), radians, shape (...)."""
-        return np.abs(T[..., 2]) if self.freedom == 3 else 2.0 * np.arccos(np.clip(np.abs(T[..., 6]), 0.0, 1.0))
-
-
-def _planar(T: _Array) -> _Array:
-    return T
+def _planar(values: _Array) -> _Array:
+    return values
 
 
 SE2 = Group(
@@ -99,6 +90,9 @@ SE2 = Group(
     se2.adjoint,
     _planar,
     _planar,
+    _planar,
+    se2.shift_m,
+    se2.turn_rad,
 )
 SE3 = Group(
     se3.IDENTITY,
@@ -113,6 +107,9 @@ SE3 = Group(
     se3.adjoint,
     se3.to_plane,
     se3.from_plane,
+    se3.planar_information,
+    se3.shift_m,
+    se3.turn_rad,
 )
 
 

@@ -59,6 +59,17 @@ def between(T_a_b: ArrayLike, T_a_c: ArrayLike) -> Array:
     return np.stack(np.broadcast_arrays(cos * dx + sin * dy, cos * dy - sin * dx, turn), axis=-1)
 
 
+def shift_m(T_a_b: ArrayLike) -> Any:
+    """Length of the translation, metres, shape (...)."""
+    T = np.asarray(T_a_b, dtype=np.float64)
+    return np.hypot(T[..., 0], T[..., 1])
+
+
+def turn_rad(T_a_b: ArrayLike) -> Any:
+    """Angle of the rotation, radians, shape (...)."""
+    return np.abs(np.asarray(T_a_b, dtype=np.float64)[..., 2])
+
+
 def motion(T_a_b: Array, T_a_c: Array) -> Pose:
     """``between`` of two single poses, shape (3,), as numbers."""
     (x, y, theta), (u, v, phi) = T_a_b.tolist(), T_a_c.tolist()

@@ -5,6 +5,8 @@ order of TUM files. ``T_a_b`` takes coordinates in b to a. A tangent is ``(v_x, 
 radians, in the frame of the body. Every function broadcasts over the leading dimensions.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -152,6 +154,22 @@ def adjoint(T_a_b: ArrayLike) -> Array:
     matrix[..., :3, :3] = matrix[..., 3:, 3:] = R
     matrix[..., :3, 3:] = _skew(pose[..., :3]) @ R
     return matrix
+
+
+def planar_information(information: ArrayLike) -> Array:
+    """Information (..., 3, 3) of x, y and heading, whatever the others are, of an information (..., 6, 6)."""
+    covariance = np.linalg.inv(np.asarray(information, dtype=np.float64))[..., [[0], [1], [5]], [0, 1, 5]]
+    return np.asarray(np.linalg.inv(covariance), np.float64)
+
+
+def shift_m(T_a_b: ArrayLike) -> Any:
+    """Length of the translation, metres, shape (...)."""
+    return np.linalg.norm(np.asarray(T_a_b, dtype=np.float64)[..., :3], axis=-1)
+
+
+def turn_rad(T_a_b: ArrayLike) -> Any:
+    """Angle of the rotation, radians, shape (...)."""
+    return 2.0 * np.arccos(np.clip(np.abs(np.asarray(T_a_b, dtype=np.float64)[..., 6]), 0.0, 1.0))
 
 
 def relative(poses: ArrayLike) -> Array:

@@ -5,6 +5,8 @@ the rotations held (Carlone et al., ICRA 2015, in the plane). In space, rotation
 of each is taken.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -43,7 +45,7 @@ def initialize(graph: PoseGraph, weights: ArrayLike | None = None) -> FloatArray
     structure, held = find_structure(i, j, len(graph)), graph.components(kept) == np.arange(len(graph))
     information = edges.information[kept]
     of = _in_plane if graph.group is SE2 else _in_space
-    poses = of(structure, T_i_j, information, scale, start, held)
+    poses = of(_Problem(structure, T_i_j, information, scale, start, held))
     poses[held] = start[held]
     return poses
 
@@ -68,14 +70,19 @@ def initialize_robust(graph: PoseGraph) -> FloatArray:
     return poses
 
 
-def _in_plane(
-    structure: Structure,
-    T_i_j: FloatArray,
-    information: FloatArray,
-    scale: FloatArray,
-    start: FloatArray,
-    held: NDArray[np.bool_],
-) -> FloatArray:
+class _Problem(NamedTuple):
+    structure: Structure
+    T_i_j: FloatArray
+    information: FloatArray
+    scale: FloatArray
+    """Of each edge's information."""
+    start: FloatArray
+    held: NDArray[np.bool_]
+    """Variables that stay at ``start``."""
+
+
+def _in_plane(problem: _Problem) -> FloatArray:
+    structure, T_i_j, information, scale, start, held = problem
     i, *_ = structure
     k_heading = np.sqrt(scale * _clip_to_median(information[:, 2, 2]))
     k_position = np.sqrt(scale * _clip_to_median(0.5 * (information[:, 0, 0] + information[:, 1, 1])))
@@ -89,14 +96,8 @@ def _in_plane(
     return np.stack((position.real, position.imag, se2.wrap_angle(heading)), axis=-1)
 
 
-def _in_space(
-    structure: Structure,
-    T_i_j: FloatArray,
-    information: FloatArray,
-    scale: FloatArray,
-    start: FloatArray,
-    held: NDArray[np.bool_],
-) -> FloatArray:
+def _in_space(problem: _Problem) -> FloatArray:
+    structure, T_i_j, information, scale, start, held = problem
     i, j, *_ = structure
     middle = np.einsum("eaa->ea", information).reshape(-1, 2, 3).mean(axis=2)
     k_position, k_turn = (np.sqrt(scale * _clip_to_median(each)) for each in middle.T)

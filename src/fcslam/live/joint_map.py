@@ -139,17 +139,18 @@ def beams_on_teammates(
         places: of the other robots in that map: x, y and the age of their poses, shape (N, 3), metres and seconds.
         joint, radius_m: the joint map, and the radius of a robot.
     """
+    T_map_base = se2.compose(T_map_before, se2.between(T_odom_before, scan.T_odom_base))
+    near = _near(T_map_base, places, radius_m, scan.laser.max_range_m)
+    if len(near) == 0:
+        return None
     origins, directions = rays_of(scan.laser, scan.sweep)
     found: NDArray[np.bool_] | None = _on_discs(
         scan.ranges_m,
         origins,
         directions,
         scan.laser.max_range_m,
-        T_map_before,
-        T_odom_before,
-        scan.T_odom_base,
-        places,
-        radius_m,
+        T_map_base,
+        near,
         joint.cells,
         joint.origin_xy,
         joint.resolution_m,
@@ -157,46 +158,35 @@ def beams_on_teammates(
     return found
 
 
+def _near(T_map_base: FloatArray, places: FloatArray, radius_m: float, reach_m: float) -> FloatArray:
+    """x and y in ``base``, and the squared radius, of the discs on which robots within reach may be, shape (K, 3)."""
+    x, y = (places[:, :2] - T_map_base[:2]).T
+    cos, sin = np.cos(T_map_base[2]), np.sin(T_map_base[2])
+    limit_m = radius_m + SPEED_MPS * places[:, 2]
+    discs = np.stack((cos * x + sin * y, cos * y - sin * x, limit_m**2), axis=-1)
+    near: FloatArray = discs[(places[:, 2] <= OLDEST_S) & (np.hypot(x, y) <= reach_m + limit_m)]
+    return near
+
+
 @njit
 def _on_discs(  # type: ignore[no-untyped-def]
-    ranges, origins, directions, reach, T_map_before, T_odom_before, T_odom_base,
-    places, radius, cells, corner, side,
+    ranges, origins, directions, reach, T_map_base, near, cells, corner, side,
 ):  # fmt: skip
     """Whether each return lies on the free floor of a map, where a robot may be; None if none does."""
-    pose_x, pose_y, pose_theta = _driven_on(T_map_before, T_odom_before, T_odom_base)
-    cos, sin = np.cos(pose_theta), np.sin(pose_theta)
-    near = np.empty((len(places), 3))  # x and y in ``base``, and the square of its radius
-    count = 0
-    for k in range(len(places)):
-        dx, dy, age = places[k, 0] - pose_x, places[k, 1] - pose_y, places[k, 2]
-        limit = radius + SPEED_MPS * age
-        if age <= OLDEST_S and np.hypot(dx, dy) <= reach + limit:
-            near[count] = cos * dx + sin * dy, cos * dy - sin * dx, limit * limit
-            count += 1
-    if count == 0:
-        return None
+    cos, sin = np.cos(T_map_base[2]), np.sin(T_map_base[2])
     found, is_any = np.zeros(len(ranges), np.bool_), False
     for i in range(len(ranges)):
         r = ranges[i]
         if not 0.0 < r < reach:
             continue
         x, y = origins[i, 0] + r * directions[i, 0], origins[i, 1] + r * directions[i, 1]
-        for k in range(count):
+        for k in range(len(near)):
             if (x - near[k, 0]) ** 2 + (y - near[k, 1]) ** 2 <= near[k, 2]:
-                right, up = pose_x + cos * x - sin * y - corner[0], pose_y + sin * x + cos * y - corner[1]
+                right, up = T_map_base[0] + cos * x - sin * y - corner[0], T_map_base[1] + sin * x + cos * y - corner[1]
                 found[i] = _is_floor(right, up, cells, side)
                 is_any = is_any or found[i]
                 break
     return found if is_any else None
-
-
-@njit(allocates=False)
-def _driven_on(T_map_before, T_odom_before, T_odom_base):  # type: ignore[no-untyped-def]
-    """x, y and theta in ``map`` after a motion by odometry."""
-    dx, dy = T_odom_base[0] - T_odom_before[0], T_odom_base[1] - T_odom_before[1]
-    turned = T_map_before[2] - T_odom_before[2]
-    cos, sin = np.cos(turned), np.sin(turned)  # of ``odom`` in ``map``
-    return T_map_before[0] + cos * dx - sin * dy, T_map_before[1] + sin * dx + cos * dy, turned + T_odom_base[2]
 
 
 @njit(allocates=False)
