@@ -138,12 +138,12 @@ def found(run: Run) -> tuple[float, ...]:
 
 def localized(source: Any, place: Path | Any) -> tuple[Run, float]:
     """The run of a localization, and its CPU time."""
-    from fcslam.mission.localization import run_localization
+    from fcslam.mission.localization import FinishedMap, run_localization
     from fcslam.mission.mission import MissionConfig
 
     occupancy = read_map(place) if isinstance(place, Path) else place
     began = time.process_time()
-    return run_localization(source, occupancy, MissionConfig()), time.process_time() - began
+    return run_localization(source, FinishedMap(occupancy), MissionConfig()), time.process_time() - began
 
 
 def part(folder: Path, log: str, work: Path) -> tuple:

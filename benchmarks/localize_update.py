@@ -21,7 +21,7 @@ from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_f
 from fcslam.maps.occupancy_map import parse_map
 from fcslam.metrics.grid import grid_agreement
 from fcslam.metrics.trajectory import align
-from fcslam.mission.localization import run_localization
+from fcslam.mission.localization import FinishedMap, run_localization
 from fcslam.mission.mission import MissionConfig, run_mission
 
 MOVED_M = 0.15
@@ -50,7 +50,7 @@ def _judged(seed, path_m):
     )  # fmt: skip
     first, second = simulate_fleet(settings, seed, ChangingBuilding(settings.building)).robots
     mapped = run_mission([Simulated(first)], MissionConfig())
-    followed = run_localization(Simulated(second), mapped.maps[0], MissionConfig(), update=True)
+    followed = run_localization(Simulated(second), FinishedMap(mapped.maps[0]), MissionConfig(), update=True)
     path = mapped.trajectories[first.name]
     T_truth_map = align(first.T_building_base[np.searchsorted(first.stamps, path.stamps - 1e-6)], path.T_map_base)
     truth = labelled(building_now([first, second]))

@@ -32,7 +32,7 @@ from fcslam.sources import BagOptions, Source
 
 if TYPE_CHECKING:
     from fcslam.maps.changes import Changes
-    from fcslam.mission.localization import LocalizationProgress
+    from fcslam.mission.localization import FinishedMap, LocalizationProgress
 
 Recordings = StrPath | Iterable[StrPath | Source] | Mapping[str, StrPath]
 
@@ -117,7 +117,7 @@ def run_recordings(
 
 def localize(
     recording: StrPath | Source,
-    map: StrPath | OccupancyMap,  # the word that users expect
+    map: "StrPath | OccupancyMap | FinishedMap",  # the word that users expect
     *,
     initial_pose: ArrayLike | None = None,
     config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
@@ -150,19 +150,24 @@ def localize(
             deviations and quality.
     """
     from fcslam.mission.localization import (  # SciPy's images: mapping alone needs none
+        FinishedMap,
         pose_in_map,
-        read_map,
+        read_finished,
         run_localization,
     )
 
     if output is not None:
         prepare_output(Path(output), force)
     settings = settings_of(config)
-    occupancy = map if isinstance(map, OccupancyMap) else read_map(Path(map), floor)
+    if isinstance(map, FinishedMap):
+        finished = map
+    else:
+        finished = FinishedMap(map) if isinstance(map, OccupancyMap) else read_finished(Path(map), floor)
     if isinstance(recording, str | os.PathLike):
-        recording = _checked(sources.open_source(Path(recording), bag_options))
-    initial = None if initial_pose is None else pose_in_map("initial_pose", initial_pose, occupancy)
-    run = run_localization(recording, occupancy, settings, initial, progress or (lambda _: None), update)
+        options = replace(bag_options or BagOptions(), in_3d=True) if finished.ply else bag_options
+        recording = _checked(sources.whole_clouds(sources.open_source(Path(recording), options), options))
+    initial = None if initial_pose is None else pose_in_map("initial_pose", initial_pose, finished.occupancy)
+    run = run_localization(recording, finished, settings, initial, progress or (lambda _: None), update)
     if output is not None:
         run.save(output, force)
     return run

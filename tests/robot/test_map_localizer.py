@@ -11,7 +11,7 @@ from fcslam.lidar.frozen_map import frozen_map
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.fusion import fuse
 from fcslam.maps.occupancy_map import Occupancy, parse_map
-from fcslam.mission.localization import run_localization
+from fcslam.mission.localization import FinishedMap, run_localization
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import Keyscan, KeyscanId
 from fcslam.robot.frontend import RobotFrontend
@@ -64,7 +64,7 @@ def errors(poses, robot):
 
 
 def localized(scans, occupancy, name="robot", **options):
-    return run_localization(Recorded(name, scans), occupancy, MissionConfig(), **options)
+    return run_localization(Recorded(name, scans), FinishedMap(occupancy), MissionConfig(), **options)
 
 
 def test_a_robot_is_found_without_an_initial_pose(fleet, building):

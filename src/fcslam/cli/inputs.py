@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -61,12 +62,16 @@ def bag_options(given: list[str] | None) -> "BagOptions | None":
     )
 
 
-def open_recording(argument: str, sensors: list[str] | None, console: "Console") -> "tuple[Source, Survey]":
+def open_recording(
+    argument: str, sensors: list[str] | None, console: "Console", in_3d: bool = False
+) -> "tuple[Source, Survey]":
     """Open the recording of an argument ``LOG`` or ``NAME=LOG``, and print what was chosen in it."""
-    from fcslam.sources import open_source
+    from fcslam.sources import BagOptions, open_source, whole_clouds
 
     path, name = named_path(argument)
-    source = open_source(path, bag_options(sensors), name)
+    options = bag_options(sensors)
+    options = replace(options or BagOptions(), in_3d=True) if in_3d else options
+    source = whole_clouds(open_source(path, options, name), options)
     survey = source.survey()
     print_notes(console, survey.notes)
     return source, survey

@@ -84,6 +84,7 @@ def localize(
     """
     from fcslam.api import localize as localize_recording
     from fcslam.cli.progress import ProgressDisplay
+    from fcslam.mission.localization import read_finished
     from fcslam.runs import prepare_output
     from fcslam.storage.files import keep_private
 
@@ -110,23 +111,19 @@ def localize(
         return
     output = output or new_folder(RUNS)
     prepare_output(output, force)
-    recording, survey = open_recording(source, sensors, console)
-    with compiled(console), ProgressDisplay(console) as display:
+    with compiled(console):
+        finished = read_finished(map_path, floor)
+        recording, survey = open_recording(source, sensors, console, in_3d=bool(finished.ply))
+        with ProgressDisplay(console) as display:
 
-        def watch(now: "LocalizationProgress") -> None:
-            state = f"localized, quality {now.quality:.2f}" if now.is_localized else "not localized"
-            display.show("localizing", now.scans, survey.scan_count, state)
+            def watch(now: "LocalizationProgress") -> None:
+                state = f"localized, quality {now.quality:.2f}" if now.is_localized else "not localized"
+                display.show("localizing", now.scans, survey.scan_count, state)
 
-        run = localize_recording(
-            recording,
-            map_path,
-            initial_pose=initial,
-            config=settings,
-            progress=watch,
-            floor=floor,
-            update=update,
-        )
-        run.save(output, force)
+            run = localize_recording(
+                recording, finished, initial_pose=initial, config=settings, progress=watch, update=update
+            )
+            run.save(output, force)
     print_faults(console, {recording.name: recording.faults})
     _report(run, recording.name, output)
 

@@ -21,7 +21,7 @@ from fcslam.live.inputs import Lasers
 from fcslam.live.records import WIRED, EventKind, RobotEvent, RobotPose, RobotStatus, Wiring
 from fcslam.live.tracker import LiveTracker
 from fcslam.maps.occupancy_map import OccupancyMap
-from fcslam.mission.localization import LocalizedDrive, pose_in_map, read_map
+from fcslam.mission.localization import FinishedMap, LocalizedDrive, pose_in_map, read_map
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import FloatArray, StrPath, frozen
 from fcslam.robot.backend import BackendInput, NewKeyscan, Task
@@ -173,7 +173,7 @@ class LocalizedRobot(LiveTracker):
         """
         prepare_output(Path(folder), force)
         with self._lock:
-            run = self._drive.run(self.name, self._map, self._config, self._fixes, self._losses)
+            run = self._drive.run(self.name, FinishedMap(self._map), self._config, self._fixes, self._losses)
         run.save(folder, force)
         return run
 

@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.errors import SourceError
 from fcslam.geometry import se3
 from fcslam.records import FloatArray, VoxelMap
 
@@ -16,7 +17,8 @@ _AT_ONCE: Final = 50_000
 _COLOURS: Final = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], np.float64)
 """From low to high: five colours of the map viridis."""
 
-_TYPE: Final = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((c, "u1") for c in "rgb")])
+_NORMAL: Final = "nx", "ny", "nz"
+_TYPE: Final = np.dtype([*((name, "<f4") for name in ("x", "y", "z", *_NORMAL)), *((c, "u1") for c in "rgb")])
 _HEADER: Final = """ply
 format binary_little_endian 1.0
 comment points of {count} voxels of {cell:g} m with normals, coloured by height
@@ -73,11 +75,27 @@ def ply_of(maps: Sequence[tuple[VoxelMap, FloatArray]]) -> bytes:
     rows = np.zeros(len(points), _TYPE)
     for column, values in zip("xyz", points.T, strict=True):
         rows[column] = _rounded(values, 1024)
-    for column, values in zip(("nx", "ny", "nz"), normals.T, strict=True):
+    for column, values in zip(_NORMAL, normals.T, strict=True):
         rows[column] = _rounded(values, 128)
     for column, channel in zip("rgb", _colours(points[:, 2]).T, strict=True):
         rows[column] = channel
-    return _HEADER.format(count=len(points), cell=_CELL_M).encode() + rows.tobytes()
+    return _head(len(points)) + rows.tobytes()
+
+
+def read_points(ply: bytes, name: str) -> tuple[FloatArray, FloatArray]:
+    """Points (N, 3) and normals (N, 3) of a file that ``ply_of`` made and messages call ``name``."""
+    head, mark, body = ply.partition(b"end_header\n")
+    rows = np.frombuffer(body[: len(body) // _TYPE.itemsize * _TYPE.itemsize], _TYPE)
+    if not len(rows) or head + mark + rows.tobytes() != ply or head + mark != _head(len(rows)):
+        raise SourceError(f"{name}: is not a file of points that `fcslam map --3d` wrote; copy it again")
+    points, normals = (np.column_stack([rows[c] for c in names]).astype(np.float64) for names in ("xyz", _NORMAL))
+    if not (np.isfinite(points).all() and np.isfinite(normals).all()):
+        raise SourceError(f"{name}: has points that are not finite; copy it again")
+    return points, normals
+
+
+def _head(count: int) -> bytes:
+    return _HEADER.format(count=count, cell=_CELL_M).encode()
 
 
 def _rounded(values: FloatArray, steps: int) -> FloatArray:

@@ -21,6 +21,7 @@ from fcslam.records import (
     CloudScan,
     Constraint,
     ConstraintKind,
+    FloatArray,
     Keyscan,
     KeyscanId,
     Place,
@@ -48,6 +49,8 @@ class RobotFrontend3d:
         """As in ``RobotFrontend``: turns are registered whatever the odometry says, and there is no back end."""
         self.newest: Tracked | None = None
         """The newest turn; None before the first."""
+        self.mapped: tuple[MappedTurn, FloatArray] | None = None
+        """The newest keyframe, and ``T_odom_ground`` there, shape (7,); None before the first."""
         self._describes = Channel.LIDAR in config.channels
         self._packets: deque[Packet] = deque()
         self._time = self._stamp = self._certain_s = -np.inf
@@ -62,6 +65,11 @@ class RobotFrontend3d:
     def pose(self) -> ScanPose:
         """Pose of the newest turn."""
         return self.scan_poses[-1]
+
+    @property
+    def travel_m(self) -> float:
+        """Path length of the present session up to its newest keyframe, metres."""
+        return 0.0 if self._keyframes.newest is None else self._keyframes.newest.travel_m
 
     def process(self, record: SensorRecord) -> list[Packet]:
         """Process the next record of the recording; returns the packets that are ready."""
@@ -137,6 +145,7 @@ class RobotFrontend3d:
 
     def _band(self, keyframe: MappedTurn) -> Ranges:
         T_odom_ground = levelled(keyframe.T_odom_base, self._keyframes.vertical.up, keyframe.height_m)
+        self.mapped = keyframe, T_odom_ground
         around = [
             se3.transform(se3.between(T_odom_ground, each.T_odom_base), each.points) for each in self._local_maps.recent
         ]

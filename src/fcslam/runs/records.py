@@ -54,6 +54,8 @@ class LocalizedPoses:
     """Share of the walls that lie on walls of the map, where the map knows the area, shape (N,); 0 where the robot was
     not localized. It is the smaller of two shares: of the last metres and of the newest keyscan.
     """
+    T_map_base_6d: FloatArray | None = None
+    """As in ``RobotTrajectory``; the CSV file has none."""
 
     @property
     def is_localized(self) -> NDArray[np.bool_]:
@@ -63,7 +65,10 @@ class LocalizedPoses:
     def believed(self) -> RobotTrajectory:
         """The poses that the robot believed, in map 0."""
         known = self.is_localized
-        return RobotTrajectory(self.robot, 0, frozen(self.stamps[known]), frozen(self.T_map_base[known]))
+        in_space: FloatArray | None = None if self.T_map_base_6d is None else frozen(self.T_map_base_6d[known])
+        stamps: FloatArray = frozen(self.stamps[known])
+        poses: FloatArray = frozen(self.T_map_base[known])
+        return RobotTrajectory(self.robot, 0, stamps, poses, T_map_base_6d=in_space)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

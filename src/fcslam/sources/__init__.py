@@ -3,7 +3,7 @@
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag
 from fcslam.sources.faults import Fault, FaultCount, Faults
-from fcslam.sources.formats import check_copies, open_fleet, open_source
+from fcslam.sources.formats import check_copies, open_fleet, open_source, whole_clouds
 from fcslam.sources.source import WHOLE, ScanRange, Source, Survey, split
 
 __all__ = [
@@ -20,5 +20,6 @@ __all__ = [
     "open_fleet",
     "open_source",
     "split",
+    "whole_clouds",
     "write_bag",
 ]

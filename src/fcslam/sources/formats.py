@@ -45,11 +45,16 @@ def open_fleet(
         source = open_source(path, options, name) if isinstance(path, Path) else path
         bag = bag_of(source) if isinstance(path, Path) else None
         sources += [source] if bag is None else bag.robots(name)
-    if options is not None and options.in_3d:
-        from fcslam.sources.bags.cloud_bag import in_3d
+    return [whole_clouds(source, options) for source in sources]
 
-        return list(map(in_3d, sources))
-    return sources
+
+def whole_clouds(source: Source, options: BagOptions | None) -> Source:
+    """A recording as it is, or with ``in_3d`` its clouds whole."""
+    if options is None or not options.in_3d:
+        return source
+    from fcslam.sources.bags.cloud_bag import in_3d
+
+    return in_3d(source)
 
 
 def bag_of(source: Source) -> "RosBag | None":
@@ -116,7 +121,7 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
                 raise SourceError(f"{path}: holds clouds of a 3D LiDAR; map them with --3d")
             return CloudFolder(path, name or _robot_name(path))
     if format_of(path) == LOG:
-        if options is not None or robot is not None:
+        if options not in (None, BagOptions(in_3d=True)) or robot is not None:
             raise SourceError(
                 f"{path}: a {LOG} has neither topics nor tf; --sensors and a robot after a colon go with ROS bags "
                 "only, leave them out"
