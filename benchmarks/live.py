@@ -1,6 +1,6 @@
 """Many robots at once, at real time, on one service: how long it takes to take a packet in, and until it has effect.
 
-    python benchmarks/live.py [--robots 20] [--path 30] [--page]
+    python benchmarks/live.py [--robots 20] [--path 30] [--page] [--load 8]
 
 A simulated fleet (LiDAR, 360 beams at 10 Hz) is run through the robots' front ends beforehand. Then each robot's
 packets go to `fcslam serve` at the moments at which the robot had them, over a connection of its own, from one process
@@ -12,7 +12,9 @@ more buildings.
 until the process in which the fleet lives has matched, verified and solved what they bring, and a correction lies
 ready; seen by looking into the mission's file 20 times a second, which keeps nobody waiting. "Correction at the robot":
 from sending a place until the answer to the first request that the robot sends after the place has had effect. A robot
-that has nothing left to send asks once a second. Memory: the most that the
+that has nothing left to send asks once a second. "In the live map": from the answer until the run folder that the page
+shows has what the request brought. "Newest drive in the live map" is that of the last request of all. `--load` keeps so
+many other processes busy meanwhile. Memory: the most that the
 service and its worker held (VmHWM, added up). Server, worker and sender share the machine.
 CPU: user and system of each, all threads; the sender's is that of the robots' side, which a fleet has elsewhere.
 """
@@ -26,7 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -79,6 +81,8 @@ class Look(NamedTuple):
     at_s: float
     stored: int
     applied: int
+    drawn: int
+    """In the live run folder, which the page shows."""
 
 
 def main() -> None:
@@ -87,6 +91,7 @@ def main() -> None:
     parser.add_argument("--path", type=float, default=PATH_M, help="of each robot, m")
     parser.add_argument("--seed", type=int, default=1, help="of the fleet")
     parser.add_argument("--page", action="store_true", help="a browser shows the page meanwhile (make browser-test)")
+    parser.add_argument("--load", type=int, default=0, help="other processes that compute all the time")
     parser.add_argument("--in-step", action="store_true", help="all robots begin in the same millisecond")
     chosen = parser.parse_args()
     report = common.Report(__file__, __doc__ or "", chosen)
@@ -98,6 +103,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place, cloud(Path(place)) as (server, port), ExitStack() as opened:
         if chosen.page:
             opened.enter_context(_page(f"http://127.0.0.1:{port}/"))
+        opened.enter_context(_load(chosen.load))
         began_s = time.process_time()
         mission = Path(place) / "cloud" / "missions" / FIRST / "mission.sqlite"
         answers, looks = asyncio.run(_play(agendas, f"http://127.0.0.1:{port}", mission))
@@ -116,6 +122,7 @@ def main() -> None:
             ("taken in", len(sent), *_spread([each.answered_s - each.asked_s for each in sent])),
             ("in effect, all", len(sent), *_spread(_effect(sent, looks))),
             ("in effect, places", len(places), *_spread(_effect(places, looks))),
+            ("in the live map", len(sent), *_spread(drawn := _effect(sent, looks, lambda look: look.drawn))),
             ("correction at the robot", len(places), *_spread(_corrected(places, answers, looks))),
         ],
     )
@@ -126,9 +133,22 @@ def main() -> None:
         f"{chosen.robots} robots for {duration_s:.0f} s: {packets:,} packets, {size / 1e6:.1f} MB, "
         f"{size / 1e3 / duration_s / chosen.robots:.2f} kB/s a robot; {memory_mb:,.0f} MB; "
         f"CPU {cpu_s[0]:.0f} s of the service, {cpu_s[1]:.0f} s of its worker, {cpu_s[2]:.0f} s of the sender; "
-        f"{closures:.0f} accepted closures between robots, {maps:.0f} map(s) in the end."
+        f"{closures:.0f} accepted closures between robots, {maps:.0f} map(s) in the end. Newest drive in the live map: "
+        f"after {drawn[-1]:.1f} s. Load average: {os.getloadavg()[0]:.1f}."
     )
     report.write()
+
+
+@contextmanager
+def _load(processes: int) -> Iterator[None]:
+    """Processes that compute, as others on a shared machine."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
 
 
 @contextmanager
@@ -189,7 +209,7 @@ async def _play(agendas: dict[str, list[Due]], url: str, mission: Path) -> tuple
             group.create_task(_robot(name, agenda, url, began, sent, all_sent, done))
         await all_sent.wait()
         end = time.perf_counter()
-        while not (looks and looks[-1].at_s > end and looks[-1].applied >= looks[-1].stored):
+        while not (looks and looks[-1].at_s > end and looks[-1].drawn >= looks[-1].stored):
             if time.perf_counter() - end > EFFECTLESS_S:
                 raise SystemExit("live: the service has not caught up")
             await asyncio.sleep(LOOK_EVERY_S)
@@ -233,11 +253,15 @@ async def _robot(
 
 
 async def _watch(mission: Path, looks: list[Look]) -> None:
+    link, drawn, shown = mission.parent / "live", 0, None
     with closing(sqlite3.connect(f"{mission.as_uri()}?mode=ro", uri=True)) as database:
         while True:
+            if link.exists() and link.readlink() != shown:
+                shown = link.readlink()
+                drawn = int(common.metrics(link)["turns"])
             (stored,) = database.execute("SELECT count(*) FROM packets").fetchone()
             (applied,) = database.execute("SELECT ifnull(max(value), 0) FROM facts WHERE name = 'applied'").fetchone()
-            looks.append(Look(time.perf_counter(), stored, int(applied)))
+            looks.append(Look(time.perf_counter(), stored, int(applied), drawn))
             await asyncio.sleep(LOOK_EVERY_S)
 
 
@@ -254,11 +278,16 @@ def _corrected(chosen: Sequence[Sent], answers: Sequence[Sent], looks: Sequence[
     return latencies
 
 
-def _effect(chosen: Sequence[Sent], looks: Sequence[Look]) -> list[float]:
-    """For each request the time until as many packets had taken effect as were stored when it was answered."""
+def _effect(
+    chosen: Sequence[Sent], looks: Sequence[Look], count: Callable[[Look], int] = lambda look: look.applied
+) -> list[float]:
+    """For each request the time until as many packets had taken effect as were stored when it was answered.
+
+    ``count``: how many had by a look; by default they are in the fleet.
+    """
     at = np.array([look.at_s for look in looks])
     stored = np.maximum.accumulate([look.stored for look in looks])
-    applied = np.maximum.accumulate([look.applied for look in looks])
+    applied = np.maximum.accumulate([count(look) for look in looks])
     latencies = []
     for each in chosen:
         seen = min(int(np.searchsorted(at, each.answered_s)), len(at) - 1)

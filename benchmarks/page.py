@@ -151,7 +151,7 @@ def frames(browser: Any, seconds: float) -> list[tuple[str, float, str]]:
     fleet = {
         "mission": "many", "version": "1", "read_only": False, "packets": 0, "applied": 0, "waiting": 0,
         "robots": names, "maps": 1, "metrics": {}, "worker_ready": True, "may_edit": False, "map_age_s": 0.0,
-        "free_bytes": None,
+        "lacking_packets": 0, "lacking_sessions": 0, "lacking_s": 0.0, "free_bytes": None,
     }  # fmt: skip
     fixed = {
         "fleet": fleet, "maps": [{"map": 0, "floor": "", "robots": names, "zoom": 3, "extent": EXTENT}],

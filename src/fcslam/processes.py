@@ -32,8 +32,8 @@ NICENESS = 10
 Task = Callable[[], None]
 Background = BaseProcess
 """A task that runs beside this process."""
-Start = Callable[[Task], Background]
-"""Starts a task beside this process, as ``start_copy`` does."""
+Start = Callable[[Task, int], Background]
+"""Starts a task beside this process with a niceness, as ``start_copy`` does."""
 
 _log = logging.getLogger(__name__)
 Item = TypeVar("Item")
@@ -131,7 +131,7 @@ def semaphore(count: int) -> Any:
         return _copying().BoundedSemaphore(count)
 
 
-def start_copy(task: Task, niceness: int = NICENESS) -> Background:
+def start_copy(task: Task, niceness: int) -> Background:
     """Run a task in a copy of this process. It sees everything as it is now, and nothing that it changes is seen here.
 
     Threads do not exist in the copy; OpenCV must have one thread (``cv2.setNumThreads``), or the copy waits for others.

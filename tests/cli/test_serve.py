@@ -226,7 +226,7 @@ def test_a_removed_robot_leaves_no_trace_and_its_undo_neither(tmp_path, packets)
         assert client.post(f"{API}/edits/{removed['number']}/undo").status_code == 201
         assert finalized() == expected["with"]
         until(lambda: robots() == {"robot_1", "robot_2", "robot_3"})
-        until(lambda: client.get("/readyz").json() == {"status": "ready", "backlog": 0})
+        until(lambda: client.get("/readyz").json()["backlog"] == 0)
         audited = [json.loads(line)["action"] for line in (tmp_path / "data" / "audit.jsonl").read_text().splitlines()]
         assert audited[-4:] == [
             f"POST {API}/edits", f"POST {API}/finalize", f"POST {API}/edits/1/undo", f"POST {API}/finalize"

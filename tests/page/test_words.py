@@ -71,7 +71,11 @@ def test_attention_has_what_needs_a_person_and_is_empty_otherwise(told):
             {"quality": 0, "marks": [[1, 2], [3, 4]]},
         ]
     ]
-    assert told["late"] == ["The map is 2 min old, and 3 messages of robots are not in it yet."]
+    assert told["late"] == ["The map lacks the last 2 min: 3 messages of robots, 1 drive among them."]
+    (advice,) = told["lagging"]
+    assert advice.startswith("The map lacks the last 20 s: 3 messages"), (
+        "only a current map can say that they did not meet"
+    )
     assert told["contradiction"] == [
         ["What a measured contradicts the other paths.", {"view": "evidence", "robot": "a"}]
     ]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 class InlineTask:
     """A task that is done when it is started."""
 
-    def __init__(self, task: Callable[[], None]) -> None:
+    def __init__(self, task: Callable[[], None], _niceness: int) -> None:
         self.exitcode = 0
         try:
             task()

@@ -137,12 +137,13 @@ def test_a_worker_says_nothing_old_while_it_catches_up(cloud):
     cloud.put(packets)
     cloud.work()
     version, live = cloud.store.correction("b", 0).correction.version, cloud.folder.live.resolve()
+    expected = open_run(live).pose_graph_g2o
     cloud.restart()
     while cloud.worker.step():
         assert cloud.store.correction("b", 0).correction.version == version
         assert cloud.store.applied() == len(packets)
-    assert cloud.folder.live.resolve() != live, "when it has caught up, it publishes once"
-    assert open_run(cloud.folder.live).pose_graph_g2o == open_run(live).pose_graph_g2o
+    assert cloud.folder.live.resolve() != live, "when it has caught up, it publishes"
+    assert open_run(cloud.folder.live).pose_graph_g2o == expected
 
 
 def hosts(before):
@@ -224,7 +225,7 @@ def test_a_snapshot_that_does_not_fit_is_ignored_with_one_line(cloud, tmp_path, 
 
 def test_a_worker_that_is_killed_while_it_catches_up_does_not_begin_again(cloud):
     cloud.put(two_robots())
-    for _ in range(AT_ONCE + 1):
+    while cloud.store.applied() <= AT_ONCE:
         cloud.worker.step()
     assert cloud.store.applied() < len(two_robots())
     applied = []
@@ -271,8 +272,8 @@ def test_corrections_leave_while_there_is_still_a_queue(cloud):
         cloud.worker.step()
         if cloud.store.correction("a", 0) is not None:
             waiting.append(len(cloud.store.envelopes()) - cloud.store.applied())
-    assert waiting[0] > len(waiting) // 2, "most packets wait when the first correction is there"
-    each = list(dict.fromkeys(waiting))  # a snapshot is a step as well
+    each = list(dict.fromkeys(waiting))  # a snapshot and a map are steps as well
+    assert each[0] > len(two_robots()) // 2, "most packets wait when the first correction is there"
     assert each == list(range(waiting[0], -1, -1)), "a packet takes longer than a look here: each is a step"
 
 
@@ -457,20 +458,34 @@ def test_a_result_waits_for_the_packets_that_were_there_when_it_was_asked_for(cl
     assert ("finalized", number) in cloud.told
 
 
+def test_a_map_is_drawn_while_packets_wait(cloud):
+    cloud.put(two_robots())
+    drawn = set()
+    while cloud.store.applied() < len(two_robots()):
+        cloud.worker.step()
+        if cloud.folder.live.exists():
+            drawn.add(open_run(cloud.folder.live).metrics["turns"].value)
+    assert len(drawn) > 5
+
+
 def test_the_live_run_follows_and_its_certificate_is_computed_seldom_or_when_maps_join(cloud):
     packets, certificates, seen = two_robots(), [], []
     cloud.tick = 0.001
     for part in np.array_split(np.arange(len(packets)), len(packets) // 4):
         cloud.put([packets[k] for k in part])
-        cloud.now += 8.0
-        cloud.work()
+        for pause_s in (7.0, 1.0):
+            cloud.now += pause_s
+            cloud.work()
         live = open_run(cloud.folder.live)
         seen.append(sum(len(t.stamps) for t in live.trajectories.values()))
         if seen[-1]:
-            certificates.append((cloud.now, live.quality["quality.json"]))
+            certificates.append((cloud.now, live.quality.get("quality.json")))
     computed = [at for (at, one), (_, before) in zip(certificates[1:], certificates, strict=False) if one != before]
     assert 2 <= len(computed) < len(certificates) / 2
-    assert sum(np.diff(computed) < QUALITY_EVERY_S - 8.0) <= 2, "b begins, and the maps join"
+    assert sum(np.diff(computed) < QUALITY_EVERY_S - 8.0) <= 4, "b begins, and the maps join; none between"
+    cloud.now += QUALITY_EVERY_S
+    cloud.work()
+    live = open_run(cloud.folder.live)
     assert set(json.loads(live.quality["quality.json"])) == {"0"}
     assert seen == sorted(seen)
     assert seen[-1] == 2 * len(POSES)
@@ -481,13 +496,14 @@ def test_a_live_map_that_cannot_be_written_stops_nothing_and_comes_later(cloud):
     packets = two_robots()
     cloud.put(packets[:20])
     cloud.work()
-    blocked = cloud.folder.path / "snapshots" / "2"
+    shown = int(cloud.folder.live.resolve().name)
+    blocked = cloud.folder.path / "snapshots" / str(shown + 1)
     blocked.write_text("in the way")
     cloud.put(packets[20:])
     cloud.now += 1000.0
     cloud.work()
     assert cloud.store.applied() == len(packets)
-    assert cloud.folder.live.resolve().name == "1"
+    assert cloud.folder.live.resolve().name == str(shown)
     blocked.unlink()
     cloud.now += 1000.0
     cloud.work()

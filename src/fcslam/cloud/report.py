@@ -25,6 +25,8 @@ from fcslam.runs import ClosureRow, Join, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
 
+TURNS = "turns"
+"""The metric of a service's run: how many packets had taken effect."""
 LEAST_DRAWN = 10
 """Keyscans, 2.5 m of path, of a map besides the largest one that gets a picture. Sessions that ended at once need none,
 and a picture takes longer than all else about them."""

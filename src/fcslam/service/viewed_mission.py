@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from fcslam.cloud.report import TURNS
+from fcslam.cloud.sessions import session_name
 from fcslam.mission.mission_store import MissionStore
 from fcslam.runs import Run, open_run
 from fcslam.runs.folder import identity
@@ -22,6 +24,16 @@ class PacketCounts(NamedTuple):
     """That wait for an earlier one."""
     worker_ready: bool = True
     """Whether the mission's worker can apply packets now."""
+
+
+class MapLag(NamedTuple):
+    """What the drawn map lacks of what arrived."""
+
+    packets: int
+    sessions: int
+    """That are in no map yet."""
+    s: float
+    """Since the oldest of the packets arrived."""
 
 
 class ViewedMission(Protocol):
@@ -53,6 +65,16 @@ def run_of(mission: ViewedMission) -> Run:
     """The newest run, without its maps; an empty one before the first one is written."""
     folder = mission.run_folder
     return Run({}) if folder is None else viewed_run(folder)
+
+
+def map_lag(mission: ViewedMission, now_s: float) -> MapLag:
+    """What the live map of an open mission lacks; ``now_s``: seconds since 1970."""
+    run, arrived = run_of(mission), mission.packet_counts().arrived
+    packets = arrived - round(run.metrics[TURNS].value) if TURNS in run.metrics else arrived
+    if packets <= 0:
+        return MapLag(0, 0, 0.0)
+    sessions = {session_name(session.robot, session.epoch) for session in mission.sessions()}
+    return MapLag(packets, len(sessions - run.trajectories.keys()), now_s - mission.store.received_s(packets))
 
 
 _reading: dict[Path, threading.Lock] = {}

@@ -34,7 +34,7 @@ import cv2
 from fcslam.cloud.host import FleetHost
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.replies import SessionCorrection
-from fcslam.cloud.report import keyscan_track, run_of, traffic_metrics
+from fcslam.cloud.report import TURNS, keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
@@ -43,7 +43,7 @@ from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.mission.mission_store import CONFIG, Envelope, Finalization, MissionStore, Refusal, StoredPacket
-from fcslam.processes import Background, Start, emit_event, start_copy, trim_memory
+from fcslam.processes import NICENESS, Background, Start, emit_event, start_copy, trim_memory
 from fcslam.runs import QUALITY, Metric, Run
 from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
 from fcslam.service.mission_folder import MissionFolder
@@ -69,6 +69,10 @@ SNAPSHOT_EVERY_S = 5.0
 """The snapshot is not written more often than this."""
 QUALITY_EVERY_S = 30.0
 """The certificate of the live run is not computed more often than this, unless maps join or part."""
+WRITE_EVERY_S = 0.5
+"""Least time between two drawings of a map."""
+LONGEST_WAIT_S = 5.0
+"""Longest time between two drawings of a map that lacks something, whatever they cost."""
 MOST_CRASHES = 3
 """Consecutive workers that may end at one task; the next worker leaves the task out."""
 
@@ -98,7 +102,7 @@ class Worker:
         share: Share = lambda *_: None,
         make_host: Callable[[CloudConfig, Callable[[PacketNumber], Packet], VerifyPairs], FleetHost] = FleetHost,
     ) -> None:
-        config = store.fact(CONFIG)
+        config, now = store.fact(CONFIG), clock()
         self._config = CloudConfig() if config is None else CloudConfig.model_validate_json(config)
         self._folder, self._store, self._clock, self._emit_event = folder, store, clock, emit_event
         self._start, self._share = start, share
@@ -121,12 +125,17 @@ class Worker:
         self._times: dict[tuple[str, int], float] = {}
         """Newest time of each session."""
         joint = "the joint maps", JOINT, folder.joint_maps
-        self._joint_maps = _Output(*joint, share=0.5, every_s=0.5, writer=self._joint_maps_writer)
+        self._joint_maps = _Output(
+            *joint, busy_share=0.5, niceness=NICENESS, writer=self._joint_maps_writer, ended_s=now
+        )
         live = "the live map", LIVE, folder.live
-        self._live = _Output(*live, share=0.1, every_s=1.0, writer=self._live_writer)
+        # With less right to the processor, it would come minutes late on a busy machine.
+        self._live = _Output(*live, busy_share=0.1, niceness=0, writer=self._live_writer, ended_s=now)
         self._outputs = self._joint_maps, self._live
-        self._certified, self._certify_at = dict[str, int](), -math.inf
-        """The map of each session as the certificate of the live run folder was computed, and when it is due again."""
+        self._certified: dict[str, int] = {}
+        """The map of each session as the certificate of the live run folder was computed."""
+        self._certified_packets, self._certify_at = -1, now
+        """How many packets that certificate is of, and when it is due again."""
         self._heard: dict[tuple[str, int], float] = {}
         """When the newest packet of each session took effect, seconds since 1970."""
         self._concluded: tuple[tuple[int, int], FleetResult] | None = None
@@ -134,7 +143,7 @@ class Worker:
         self._resume()
         self._reported, self._report_at = self._resumed_at, -math.inf
         self._finalize_at = -math.inf
-        self._written, self._write_at = self._applied, clock() + SNAPSHOT_EVERY_S
+        self._written, self._write_at = self._applied, now + SNAPSHOT_EVERY_S
         emit_event(PROGRESS, self._applied)
 
     def step(self) -> bool:
@@ -142,6 +151,7 @@ class Worker:
         return (
             self._take_edits()
             or self._write_snapshot()
+            or any(self._write(output, is_busy=True) for output in self._outputs)
             or self._take_packets()
             or self._report()
             or self._finalize()
@@ -155,7 +165,7 @@ class Worker:
             if output.copy is not None:
                 waits_s.append(0.05)
             elif output.shown < self._applied:
-                waits_s.append(output.due_s - now)
+                waits_s.append(output.due_s() - now)
         if self._reported < self._applied:
             waits_s.append(self._report_at - now)
         return max(min(waits_s), 0.0)
@@ -175,7 +185,8 @@ class Worker:
             self._times.clear()
             self._emit_event(PROGRESS, 0)
         self._joint_maps.shown = self._live.shown = -1
-        self._live.due_s = self._clock()  # who edits the map waits for it
+        self._live.ended_s = -math.inf  # who edits the map waits for it
+        self._certified_packets = -1
         self._reported = min(self._reported, max(self._applied, self._resumed_at) - 1)
         return True
 
@@ -390,27 +401,30 @@ class Worker:
         key = (*robot_and_epoch(number.session), number.sequence)
         return decode(self._store.packets([key])[key].data)
 
-    def _write(self, output: "_Output") -> bool:
-        """Write an output in a copy of this process, if something is new and the last time is long enough ago."""
+    def _write(self, output: "_Output", is_busy: bool = False) -> bool:
+        """Write an output in a copy of this process, if something is new and the last time is long enough ago.
+
+        ``is_busy``: packets may wait.
+        """
         if output.copy is not None:
             exitcode = output.copy.exitcode
             return exitcode is not None and self._end_writing(output, exitcode)
-        is_new = output.shown != self._applied and self._applied >= self._resumed_at
-        if not is_new or self._clock() < output.due_s:
+        is_new = output.shown != self._applied or (output is self._live and self._certifies())
+        if not is_new or self._applied < self._resumed_at or self._clock() < output.due_s(is_busy):
             return False
         try:
             if self._host.fleet.read_ahead(AT_ONCE):  # after a restart, in small steps
                 return True
             write = output.writer()
-            output.began_s, output.copy = self._clock(), self._start(lambda: _written(output.name, write))
+            output.began_s = self._clock()
+            output.copy = self._start(lambda: _written(output.name, write), output.niceness)
         except Exception as error:  # packets matter more, and there may be memory later
             return self._postpone(output, f"{type(error).__name__}: {error}")
         output.shown = output.begun = self._applied
         return True
 
     def _end_writing(self, output: "_Output", exitcode: int) -> bool:
-        now, output.copy = self._clock(), None
-        output.due_s = now + max((now - output.began_s) * (1.0 / output.share - 1.0), output.every_s)
+        output.ended_s, output.copy = self._clock(), None
         if exitcode:  # packets matter more, and the disk may be freed
             return self._postpone(output, f"the writer ended with code {exitcode}")
         try:
@@ -423,7 +437,7 @@ class Worker:
 
     def _postpone(self, output: "_Output", reason: str) -> bool:
         _log.error("%s will be written later: %s", output.name, reason)
-        output.shown, output.due_s = -1, self._clock() + PAUSE_S
+        output.shown, output.ended_s = -1, self._clock() + PAUSE_S
         return False
 
     def _joint_maps_writer(self) -> Callable[[], None]:
@@ -434,18 +448,24 @@ class Worker:
         heard_s, place = dict(self._heard), self._folder.joint_maps
         return lambda: write_joint_maps(place, joint_maps_of(result, heard_s, self._config.map))
 
+    def _certifies(self) -> bool:
+        """Whether the live map is to be drawn with a new certificate. A map with news is first drawn without."""
+        is_old = self._clock() >= self._certify_at and self._certified_packets < self._applied
+        return is_old and (self._live.shown == self._applied or self._certify_at < self._clock() - QUALITY_EVERY_S)
+
     def _live_writer(self) -> Callable[[], None]:
         result, traffic = self._host.fleet.estimate(), self._store.traffic()
         maps = {robot.robot: robot.map_index for robot in result.robots}
-        is_known = (self._folder.live / f"{QUALITY}.json").exists()
-        certifies = not is_known or self._clock() >= self._certify_at or maps != self._certified
-        if certifies:
-            self._certified, self._certify_at = maps, self._clock() + QUALITY_EVERY_S
+        if certifies := self._certifies():
+            self._certified, self._certified_packets = maps, self._applied
+            self._certify_at = self._clock() + QUALITY_EVERY_S
+        elif maps != self._certified:
+            self._certified_packets, self._certify_at = -1, min(self._certify_at, self._clock())
         return lambda: self._write_live(result, traffic, certifies)
 
     def _write_live(self, result: FleetResult, traffic: Ledger, certifies: bool) -> None:
         run = self._run(result, traffic, with_local_maps=False, with_certificates=certifies)
-        if not certifies:
+        if not certifies and self._certified == {name: robot.map_index for name, robot in run.trajectories.items()}:
             files = sorted(self._folder.live.glob(f"{QUALITY}*.*"))
             run = replace(run, quality={file.name: file.read_bytes() for file in files})
         self._folder.publish(run)
@@ -458,7 +478,7 @@ class Worker:
             counts[f"words_{state.channel}_{state.detector_version}"] += state.words
         words = [Metric(name, count, "1") for name, count in counts.items()]
         tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
-        metrics = [Metric("turns", self._applied, "1"), *words, *traffic_metrics(traffic, tracks)]
+        metrics = [Metric(TURNS, self._applied, "1"), *words, *traffic_metrics(traffic, tracks)]
         return run_of(
             result,
             tracks,
@@ -511,21 +531,27 @@ class _Output:
     name: str
     shared_as: str
     place: Path
-    share: float
-    """Largest share of the time for writing."""
-    every_s: float
-    """Least time between the end of one copy and the beginning of the next."""
+    busy_share: float
+    """Largest share of the time for writing while packets wait."""
+    niceness: int
     writer: Callable[[], Callable[[], None]]
     """Gives what writes the output as it is now."""
+    ended_s: float
+    """When the newest copy ended, or this worker began."""
     shown: int = -1
     """How many packets it shows, or will when it is written; -1: it is to be written anew."""
     begun: int = -1
     """How many packets the newest copy writes."""
     copy: Background | None = None
     """The copy that writes it now."""
-    began_s: float = -math.inf
-    due_s: float = -math.inf
-    """When the newest copy began, and when the next one may begin."""
+    began_s: float = math.inf
+    """When the newest copy began."""
+
+    def due_s(self, is_busy: bool = False) -> float:
+        """When the next copy may begin; ``is_busy``: while packets wait."""
+        took_s = max(self.ended_s - self.began_s, 0.0)
+        pause_s = took_s * (1.0 / self.busy_share - 1.0) if is_busy else took_s
+        return self.ended_s + min(max(pause_s, WRITE_EVERY_S), LONGEST_WAIT_S)
 
 
 def _number(packet: StoredPacket | Envelope) -> PacketNumber:

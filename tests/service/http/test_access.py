@@ -92,7 +92,9 @@ def test_a_stranger_gets_no_data(desk):
     desk.told(desk.send("a", A[:9]))
     answers = {path: desk.ask("GET", path) for path in sorted(OPEN)}
     assert {answer.status_code for answer in answers.values()} == {200}
-    assert answers["/healthz"].json().keys() | answers["/readyz"].json().keys() == {"status", "backlog"}
+    assert answers["/healthz"].json().keys() | answers["/readyz"].json().keys() == {
+        *("status", "backlog", "lacking_packets", "lacking_sessions", "lacking_s")
+    }
     assert answers["/openapi.json"].json() == interface, "whatever robots sent"
 
 

@@ -317,7 +317,8 @@ def test_a_robot_is_told_that_it_is_removed(mapped):
 
 
 def test_the_service_is_ready_when_the_worker_has_caught_up(desk, monkeypatch):
-    assert desk.ask("GET", "/readyz").json() == {"status": "ready", "backlog": 0}
+    current = {"status": "ready", "backlog": 0, "lacking_packets": 0, "lacking_sessions": 0, "lacking_s": 0.0}
+    assert desk.ask("GET", "/readyz").json() == current
     worker = desk.state.mission.worker
     notify, worker.notify = worker.notify, lambda: None
     monkeypatch.setattr("fcslam.service.http.app.LARGEST_BACKLOG", 5)
@@ -325,10 +326,13 @@ def test_the_service_is_ready_when_the_worker_has_caught_up(desk, monkeypatch):
         desk.told(desk.send("a", A[:count]))
         answer = desk.ask("GET", "/readyz")
         assert (answer.status_code, answer.json()["backlog"]) == (status, count)
+        shown = get(desk, "fleet").json()
+        assert (shown["lacking_packets"], shown["lacking_sessions"]) == (count, 1)
+        assert shown["lacking_s"] > 0.0
     assert "6 packets" in answer.json()["error"]
     assert desk.ask("GET", "/healthz").status_code == 200
     notify()
-    assert desk.ask("GET", "/readyz").json() == {"status": "ready", "backlog": 0}
+    assert desk.ask("GET", "/readyz").json() == current
     worker.is_ready = False
     assert desk.ask("GET", "/readyz").status_code == 503
 

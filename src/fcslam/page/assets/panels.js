@@ -6,7 +6,7 @@ import { heightText } from "./heights.js";
 import { chart, choose, fit, goTo, openMap, redraw, showLayers } from "./map.js";
 import { ask, at, json, link, report } from "./service.js";
 import { change, tell } from "./tools.js";
-import { accuracy, attention, count, dayOf, decisionOf, duration, editOf, evidence, history, joinsOf, listed, metres, moment, sensorOf, stateOf } from "./words.js";
+import { accuracy, attention, count, dayOf, decisionOf, duration, editOf, evidence, history, joinsOf, lackOf, listed, metres, moment, sensorOf, stateOf } from "./words.js";
 
 const LISTED = 200; // rows of the table of evidence
 const NEAR_M = 5; // pairs with both ends so near each other show the same place
@@ -87,8 +87,7 @@ export function showMaps() {
 export function showAge() {
   const { counts, readOnly } = fleet;
   if (!counts) return;
-  const missing = counts.packets - counts.applied, age = counts.map_age_s === null ? null : counts.map_age_s + (Date.now() - fleet.readAt) / 1000;
-  at("age").textContent = readOnly || age === null ? "" : `Map drawn ${duration(age)} ago${missing > 0 ? `; ${count(missing, "message")} not in it yet` : ""}. `;
+  at("age").textContent = readOnly || counts.map_age_s === null ? "" : `${lackOf(counts) || "The map is up to date"}. `;
   if (!link.connected) return; // the status says why
   at("status").textContent = readOnly ? "Finished run" : counts.worker_ready ? "Live" : "The map catches up after a start";
   at("status").dataset.kind = readOnly || counts.worker_ready ? "ok" : "wait";

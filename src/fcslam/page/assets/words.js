@@ -6,7 +6,7 @@ const CLOCK_S = 1e9; // later stamps count from 1970, smaller ones from an arbit
 const LOW_DISK_BYTES = 2e9;
 const LOOK_ALIKE = 0.5; // maps that fit so well elsewhere, as a share, may show places that only look alike
 const MOST_JOINS = 3; // that the card of a robot names
-const LATE_S = 30; // a map that is older while news wait is late
+const LATE_S = 5, LAGGING_S = 30; // a map that lacks older news is not current; so old, somebody should know
 const CONTRADICTIONS = ["joins_contradicting_maps", "maps_contradict"];
 
 export function duration(seconds) {
@@ -81,12 +81,19 @@ export function accuracy({ quality, readOnly, maps }) {
   return cells.length ? `${cells.filter((c) => c.good).length.toLocaleString("en")} of ${cells.length.toLocaleString("en")} m² of the map are accurate to ${Math.round(100 * first.bar)} cm.` : "";
 }
 
+// What the drawn map lacks; empty if it is current.
+export function lackOf({ lacking_packets, lacking_sessions, lacking_s }) {
+  const sessions = lacking_sessions ? `, ${count(lacking_sessions, "drive")} among them` : "";
+  return lacking_s > LATE_S ? `The map lacks the last ${duration(lacking_s)}: ${count(lacking_packets, "message")} of robots${sessions}` : "";
+}
+
 // Why two maps are apart, and what would help.
-function separation(s, maps) {
+function separation(s, maps, lack) {
   const [first, second] = s.maps.map((k) => maps.find((m) => m.map === k)?.robots ?? []);
   const seen = s.verified ? "They may have been at the same place, but the evidence is weak or contradicts itself." : s.candidates ? "Some places look alike, but their walls do not fit." : "They have not seen the same place yet.";
   const text = first.length + second.length > 2 ? `${listed(first)} on one map, ${listed(second)} on another.` : `${first} and ${second} have separate maps.`;
   if (s.reason === "vetoed") return { kind: "wait", text, help: "Somebody said that they did not see the same place. If they did, take that edit back.", why: s.explanation, action: "Open edits", do: { view: "edits" } };
+  if (lack) return { kind: "wait", text, help: `${lack}. They may be joined when it has caught up.`, why: s.explanation, action: "Show both maps", do: { map: s.maps[1], beside: s.maps[0] } };
   const help = `${seen} Drive ${second[0]} through an area that ${first[0]} has mapped, for at least 10 m.`;
   return { kind: "wait", text, help, why: s.explanation, action: "Show both maps", do: { map: s.maps[1], beside: s.maps[0] } };
 }
@@ -108,13 +115,13 @@ export function attention({ robots, maps, separations, quality, counts, contradi
   for (const s of [...separations].sort((a, b) => b.verified - a.verified || b.candidates - a.candidates || a.maps[0] - b.maps[0])) {
     if (told.has(s.maps[1])) continue;
     told.add(s.maps[1]);
-    found.push(separation(s, maps));
+    found.push(separation(s, maps, readOnly ? "" : lackOf(counts)));
   }
   for (const [map, { bar, cells, drives }] of Object.entries(quality))
     if (drives.length)
       found.push({ kind: "wait", text: `${count(cells.filter((c) => !c.good).length, "square metre")} of the map may be off by more than ${metres(bar)}.`, help: drives.map((d) => `${d.text[0].toUpperCase()}${d.text.slice(1)}.`).join(" "), why: "", action: "Show where", do: { quality: Number(map), marks: drives.flatMap((d) => [d.from, d.to]) } });
-  if (!readOnly && counts.map_age_s > LATE_S && counts.packets > counts.applied)
-    found.push({ kind: "wait", text: `The map is ${duration(counts.map_age_s)} old, and ${count(counts.packets - counts.applied, "message")} of robots are not in it yet.`, help: "Robots send faster than this machine can map. It will catch up when they pause; the robots' positions stay current.", why: "", action: "Show the robots", do: { view: "fleet" } });
+  if (!readOnly && counts.lacking_s > LAGGING_S)
+    found.push({ kind: "wait", text: `${lackOf(counts)}.`, help: "Robots send faster than this machine can map. It will catch up when they pause; the robots' positions stay current.", why: "", action: "Show the robots", do: { view: "fleet" } });
   return found;
 }
 

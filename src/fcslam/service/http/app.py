@@ -1,6 +1,7 @@
 """The ASGI application, and its routes for operators; what it needs is given to it."""
 
 import json
+import time
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from contextvars import ContextVar
@@ -26,6 +27,7 @@ from fcslam.service.http.problems import add_handlers, problem
 from fcslam.service.http.responses import file_of, refusals
 from fcslam.service.http.robots import detector_router, robot_router
 from fcslam.service.http.state import ServiceState
+from fcslam.service.viewed_mission import map_lag
 
 LARGEST_BACKLOG = 200
 """Packets that may wait for a worker that is ready: fifty robots send as many in two seconds."""
@@ -54,9 +56,12 @@ def operations_router(state: ServiceState) -> APIRouter:
             raise HTTPException(503, f"the service takes packets, but the worker is {is_down}")
         return {"status": "ok"}
 
-    @router.get("/readyz", response_model=dict[str, str | int], responses=refusals(503))
-    def get_readiness() -> dict[str, str | int] | JSONResponse:
-        """200 while the worker follows what robots send, 503 while it starts or catches up."""
+    @router.get("/readyz", response_model=dict[str, str | float], responses=refusals(503))
+    def get_readiness() -> dict[str, str | float] | JSONResponse:
+        """200 while the worker follows what robots send, 503 while it starts or catches up.
+
+        ``lacking_packets``, ``lacking_sessions``, ``lacking_s``: what the drawn map lacks, as ``/api/v1/fleet`` has it.
+        """
         backlog = state.mission.intake.ready_count() - state.mission.worker.applied
         if state.closing or not state.mission.worker.is_ready:
             return problem(
@@ -64,7 +69,9 @@ def operations_router(state: ServiceState) -> APIRouter:
             )
         if backlog > LARGEST_BACKLOG:
             return problem(503, f"the worker is catching up: {backlog} packets have no effect yet", backlog=backlog)
-        return {"status": "ready", "backlog": backlog}
+        lag = map_lag(state.mission, time.time())
+        lacking = {f"lacking_{name}": number for name, number in lag._asdict().items()}
+        return {"status": "ready", "backlog": backlog, **lacking}
 
     @router.get("/api/v1/audit", dependencies=state.require(Role.ADMIN), responses=refusals(400, 401, 403, 503))
     def get_audit(limit: Annotated[int, Query(ge=1, le=10_000)] = 100) -> list[AuditEntry]:

@@ -43,7 +43,7 @@ from fcslam.service.http.responses import (
 from fcslam.service.http.robots import Name
 from fcslam.service.http.state import ViewerState
 from fcslam.service.keyscans import live_pose, live_scan, overlay_png
-from fcslam.service.viewed_mission import ViewedMission, run_of
+from fcslam.service.viewed_mission import MapLag, ViewedMission, map_lag, run_of
 from fcslam.wire.limits import MAXIMUM_EPOCH
 
 EVENTS = "text/event-stream"
@@ -72,12 +72,16 @@ def fleet_router(state: ViewerState) -> APIRouter:
         mission = state.mission
         run, counts, folder = run_of(mission), mission.packet_counts(), mission.run_folder
         is_live = folder is not None and not state.read_only
+        lag = MapLag(0, 0, 0.0) if state.read_only else map_lag(mission, time.time())
         return FleetSummary(
             mission=mission.name,
             version=fcslam.__version__,
             read_only=state.read_only,
             may_edit=not state.read_only and state.admits(request, Role.ADMIN),
             map_age_s=max(time.time() - folder.stat().st_mtime, 0.0) if folder is not None and is_live else None,
+            lacking_packets=lag.packets,
+            lacking_sessions=lag.sessions,
+            lacking_s=max(lag.s, 0.0),
             free_bytes=shutil.disk_usage(folder).free if folder is not None and is_live else None,
             packets=counts.arrived,
             applied=counts.applied,

@@ -54,6 +54,9 @@ class FleetSummary(StrictModel):
     map_age_s: float | None = Field(
         description="seconds since the map was drawn; null before that, and for a finished run"
     )
+    lacking_packets: int = Field(description="number of packets that arrived and are not in the map yet")
+    lacking_sessions: int = Field(description="number of sessions that are in no map yet, while packets are lacking")
+    lacking_s: float = Field(description="seconds since the oldest packet arrived that is not in the map yet; 0: none")
     free_bytes: int | None = Field(description="bytes that are free on the disk of the map; null as for its age")
     packets: int = Field(description="number of packets that arrived")
     applied: int = Field(description="number of packets that took effect")
