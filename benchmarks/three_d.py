@@ -1,20 +1,21 @@
-"""Fleets with 3D LiDARs: do two robots with unknown starts get one map, how exact is it, and do strangers stay apart?
+"""Fleets with 3D LiDARs: do two robots with unknown starts get one map, how exact is it, do others stay apart?
 
-    python benchmarks/three_d.py /path/to/bags
-    python benchmarks/three_d.py /path/to/bags --seeds 41 --flat
+    python benchmarks/three_d.py /path/to/bags --kept rows.jsonl
+    python benchmarks/three_d.py /path/to/bags --ramp 41 --flat --strangers --alike 41
 
 Bags are of a simulator outside of this repository: a corridor with rooms on both sides, furniture, lintels, a ceiling,
 and a ramp of 1.4 m half-way. Robots have 16 rings at 10 Hz, turn at up to 1.2 rad/s, and have wheels whose scale is off
 by 1.5 % and whose turns are off by 3 %. `s<seed>a` and `s<seed>b` are the first and the last 60 % of a drive through
 the building of a seed. Of `f<seed>a` and `f<seed>l`, in a building without the ramp, the second has a 2D LiDAR 0.3 m
-over the floor. Beside each bag, `<bag>.truth.tum` has the true pose at each scan.
+over the floor. `l<seed>b` is as `s<seed>b`, on a floor with the same walls and other furniture. Beside each bag,
+`<bag>.truth.tum` has the true pose at each scan.
 
 Errors are those of the positions of both robots after one rigid alignment, which rotations fix, too. Strangers are the
-first robot of one seed and the second one of the next seed.
+first robot of one seed and the second one of the next seed. Floors that look alike are `s<seed>a` and `l<seed>b`.
 """
 
 import heapq
-from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,9 +36,10 @@ from fcslam.sources import BagOptions, open_fleet
 from fcslam.wire.packets import SizedPacket
 
 SPACE = MissionConfig.model_validate({"fleet": {"dimensions": 3}})
-COLUMNS = {"seed": "", "robots": "", "maps": "", "closures": "", "ATE (RMSE), m": ".4f", "in the plane, m": ".4f",
+RAMP, FLAT = (41, 42, 43, 44, 45, 61, 62, 63, 64, 65), (31, 51, 52, 71, 72, 73, 74, 75, 76, 77)
+COLUMNS = {"seed": "", "maps": "", "closures": "", "ATE (RMSE), m": ".4f", "in the plane, m": ".4f",
            "max, m": ".3f", "rotation, deg": ".3f", "uplink, kB/s": ".1f"}  # fmt: skip
-STRANGER_COLUMNS = {"robots": "", "maps": "", "closures": ""}
+APART_COLUMNS = {"robots": "", "maps": "", "closures": ""}
 
 
 class Drive(NamedTuple):
@@ -50,28 +52,31 @@ class Drive(NamedTuple):
 def main() -> None:
     parser = common.options(__doc__)
     parser.add_argument("bags", type=Path, help="folder of the bags")
-    parser.add_argument("--seeds", nargs="*", type=int, default=(41, 42, 43, 44, 45), help="with a ramp")
-    parser.add_argument("--flat", nargs="*", type=int, default=(31, 51, 52), help="seeds without a ramp")
-    parser.add_argument("--processes", type=int, default=2, help="recordings and fleets at a time")
+    parser.add_argument("--ramp", nargs="*", type=int, default=RAMP, help="seeds of two robots with 3D LiDARs")
+    parser.add_argument("--flat", nargs="*", type=int, default=FLAT, help="seeds of a 3D LiDAR and a 2D LiDAR")
+    parser.add_argument("--strangers", nargs="*", type=int, default=RAMP, help="seeds of robots in other buildings")
+    parser.add_argument("--alike", nargs="*", type=int, default=RAMP, help="seeds of robots on floors that look alike")
+    parser.add_argument("--kept", type=Path, help="file that keeps finished fleets, so that an interrupted run goes on")
     chosen = parser.parse_args()
-    pairs = [(seed, "3D, 3D", f"s{seed}a", f"s{seed}b") for seed in chosen.seeds]
-    pairs += [(seed, "3D, 2D", f"f{seed}a", f"f{seed}l") for seed in chosen.flat]
-    first, second = [one for *_, one, _ in pairs], [other for *_, other in pairs]
-    apart = list(zip(first, second[1:] + second[:1], strict=True))[: len(chosen.seeds)]
-    with ProcessPoolExecutor(chosen.processes) as pool:
-        names, bags = ["anna"] * len(first) + ["ben"] * len(second), first + second
-        driven = pool.map(drive, names, [chosen.bags / bag for bag in bags])
-        drives = dict(zip(bags, driven, strict=True))
-        fleets = [*zip(first, second, strict=True), *apart]
-        results = list(pool.map(result_of, *([drives[bag] for bag in side] for side in zip(*fleets, strict=True))))
-    report = common.Report(__file__, __doc__, chosen)
-    found = zip(pairs, results, strict=False)
-    report.table("Two robots of one building", COLUMNS, [row_of(chosen.bags, drives, *each) for each in found])
-    others = zip(apart, results[len(pairs) :], strict=True)
-    report.table("Strangers", STRANGER_COLUMNS, [(", ".join(pair), *maps_and_closures(one)) for pair, one in others])
+    kept, report = common.Kept(chosen.kept), common.Report(__file__, __doc__, chosen)
+    after = dict(zip(chosen.strangers, (*chosen.strangers[1:], *chosen.strangers[:1]), strict=True))
+    fleets = {
+        "Two robots with 3D LiDARs, with a ramp": [(seed, f"s{seed}a", f"s{seed}b") for seed in chosen.ramp],
+        "A robot with a 3D LiDAR and one with a 2D LiDAR, flat": [(k, f"f{k}a", f"f{k}l") for k in chosen.flat],
+        "Strangers": [(seed, f"s{seed}a", f"s{after[seed]}b") for seed in chosen.strangers],
+        "Floors that look alike": [(seed, f"s{seed}a", f"l{seed}b") for seed in chosen.alike],
+    }
+    for title, pairs in fleets.items():
+        is_one = title.startswith(("Two", "A robot"))
+        rows = []
+        for seed, *pair in pairs:
+            rows += kept.rows((title, seed), partial(rows_of, chosen.bags, seed, pair, is_one))
+            print(*rows[-1], flush=True)
+        report.table(title, COLUMNS if is_one else APART_COLUMNS, rows)
     report.write()
 
 
+@lru_cache(maxsize=4)
 def drive(name: str, bag: Path) -> Drive:
     [source] = open_fleet([(bag, name)], BagOptions(in_3d=True))
     driven = list(legs(calibrated(source, SPACE.robot.lidar), SPACE.robot))
@@ -92,19 +97,22 @@ def maps_and_closures(result: FleetResult) -> tuple[int, int]:
     return len({robot.map_index for robot in result.robots}), between
 
 
-def row_of(bags: Path, drives: dict[str, Drive], pair: tuple[int, str, str, str], result: FleetResult) -> tuple:
-    seed, robots, one, other = pair
+def rows_of(bags: Path, seed: int, pair: list[str], is_one: bool) -> list[tuple]:
+    drives = [drive(name, bags / bag) for name, bag in zip(("anna", "ben"), pair, strict=True)]
+    result = result_of(*drives)
     maps, closures = maps_and_closures(result)
+    if not is_one:
+        return [(", ".join(pair), maps, closures)]
     found, true, uplink = [], [], []
-    for name, bag in (("anna", one), ("ben", other)):
+    for name, bag, driven in zip(("anna", "ben"), pair, drives, strict=True):
         stamps, poses = read_tum_6d(bags / f"{bag}.truth.tum")
         for robot in (robot for robot in result.robots if robot_of(robot.robot) == name):
-            track = drives[bag].tracks[robot.robot]
+            track = driven.tracks[robot.robot]
             found.append(track.on_keyscans(robot.space.T_map_base))
             true.append(poses[np.abs(stamps[:, None] - track.stamps).argmin(axis=0)])
-        uplink.append(sum(sent.size for sent in drives[bag].packets) / 1e3 / float(np.ptp(stamps)))
+        uplink.append(sum(sent.size for sent in driven.packets) / 1e3 / float(np.ptp(stamps)))
     errors = errors_of(np.concatenate(found), np.concatenate(true)) if maps == 1 else 4 * (float("nan"),)
-    return seed, robots, maps, closures, *errors, max(uplink)
+    return [(seed, maps, closures, *errors, max(uplink))]
 
 
 def errors_of(found: np.ndarray, true: np.ndarray) -> tuple[float, ...]:
