@@ -15,7 +15,7 @@ first robot of one seed and the second one of the next seed. Floors that look al
 """
 
 import heapq
-from functools import lru_cache, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -62,9 +62,9 @@ def main() -> None:
     after = dict(zip(chosen.strangers, (*chosen.strangers[1:], *chosen.strangers[:1]), strict=True))
     fleets = {
         "Two robots with 3D LiDARs, with a ramp": [(seed, f"s{seed}a", f"s{seed}b") for seed in chosen.ramp],
-        "A robot with a 3D LiDAR and one with a 2D LiDAR, flat": [(k, f"f{k}a", f"f{k}l") for k in chosen.flat],
-        "Strangers": [(seed, f"s{seed}a", f"s{after[seed]}b") for seed in chosen.strangers],
         "Floors that look alike": [(seed, f"s{seed}a", f"l{seed}b") for seed in chosen.alike],
+        "Strangers": [(seed, f"s{seed}a", f"s{after[seed]}b") for seed in chosen.strangers],
+        "A robot with a 3D LiDAR and one with a 2D LiDAR, flat": [(k, f"f{k}a", f"f{k}l") for k in chosen.flat],
     }
     for title, pairs in fleets.items():
         is_one = title.startswith(("Two", "A robot"))
@@ -76,7 +76,7 @@ def main() -> None:
     report.write()
 
 
-@lru_cache(maxsize=4)
+@cache
 def drive(name: str, bag: Path) -> Drive:
     [source] = open_fleet([(bag, name)], BagOptions(in_3d=True))
     driven = list(legs(calibrated(source, SPACE.robot.lidar), SPACE.robot))
@@ -97,7 +97,7 @@ def maps_and_closures(result: FleetResult) -> tuple[int, int]:
     return len({robot.map_index for robot in result.robots}), between
 
 
-def rows_of(bags: Path, seed: int, pair: list[str], is_one: bool) -> list[tuple]:
+def rows_of(bags: Path, seed: int, pair: list[str], is_one: bool) -> list[tuple[object, ...]]:
     drives = [drive(name, bags / bag) for name, bag in zip(("anna", "ben"), pair, strict=True)]
     result = result_of(*drives)
     maps, closures = maps_and_closures(result)
@@ -108,6 +108,7 @@ def rows_of(bags: Path, seed: int, pair: list[str], is_one: bool) -> list[tuple]
         stamps, poses = read_tum_6d(bags / f"{bag}.truth.tum")
         for robot in (robot for robot in result.robots if robot_of(robot.robot) == name):
             track = driven.tracks[robot.robot]
+            assert robot.space is not None
             found.append(track.on_keyscans(robot.space.T_map_base))
             true.append(poses[np.abs(stamps[:, None] - track.stamps).argmin(axis=0)])
         uplink.append(sum(sent.size for sent in driven.packets) / 1e3 / float(np.ptp(stamps)))

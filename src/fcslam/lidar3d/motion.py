@@ -90,19 +90,19 @@ class MotionSensors:
         return Prediction(_chain(moves, turns), np.maximum(sigma, 1e-5), planar, rotation)
 
     def learn(
-        self, predicted: Prediction, motion: FloatArray, length_s: float, sigma_rad: float, is_fixed: bool
+        self, predicted: Prediction, motion: FloatArray, moved: FloatArray | None, length_s: float, sigma_rad: float
     ) -> None:
         """Learn from the motion (7,) that registration found for a prediction over ``length_s``.
 
-        ``sigma_rad`` is the standard deviation of its rotation; ``is_fixed`` whether the surfaces that were seen fix it
-        in every direction.
+        ``moved`` (7,) is from the predicted begin on, where most of a small error of the wheels is found; None if the
+        surfaces do not fix it in every direction. ``sigma_rad`` is the standard deviation of the rotation.
         """
         tangent = se3.log(motion)
         self.velocity, self._is_moving_known = tangent / length_s, True
-        if predicted.planar is not None and is_fixed:
+        if predicted.planar is not None and moved is not None:
             planar = predicted.planar
             error = odometry_error(float(np.hypot(*planar[:2])), abs(planar[2]), _WHEELS)
-            found = se2.motion(np.array(self.trust.motion(planar)), se3.to_plane(motion))
+            found = se2.motion(np.array(self.trust.motion(planar)), se3.to_plane(moved))
             self.trust = self.trust.learn(found, error, planar)
         if predicted.rotation is not None:
             rests = np.linalg.norm(predicted.planar or tangent) < _AT_REST

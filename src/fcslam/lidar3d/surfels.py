@@ -26,6 +26,8 @@ FEWEST_POINTS: Final = 6
 """Least number of points of a surfel."""
 _WIDEST_RATIO: Final = 0.06
 """Largest ratio of the two smallest variances of the points of a surfel: along the normal, and across."""
+_UNEVEN: Final = 0.02
+"""Standard deviation of a normal, in radians, however many points show it: no wall is plane."""
 _OFFSET = 1 << 19
 
 
@@ -85,9 +87,9 @@ class SurfelMap:
         position: FloatArray,
         corrections: FloatArray,
         gate_m: float,
-    ) -> tuple[FloatArray, FloatArray, float, int]:
-        """Matrix (12, 12) and vector (12,) of least squares from points to surfels, the part of the trace of the
-        matrix's translations that errors of normals make, and the number of points.
+    ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+        """Matrix (12, 12) and vector (12,) of least squares from points to surfels, the part of the matrix that errors
+        of normals make, for one motion of all points (6, 6), and the number of points.
 
         Args:
             points: (N, 3), by the predicted motion moved to the frame of the robot at the scan's first point.
@@ -96,11 +98,26 @@ class SurfelMap:
             corrections: (2, 6), tangents at that pose: of the begin and of the end; between, they are interpolated.
             gate_m: largest distance of a point from its surfel.
         """
-        H, b = np.zeros((12, 12)), np.zeros(12)
-        noise, found = _accumulate(
-            self._keys, self._rows, self._planes, points, shares, rotation, position, corrections, gate_m, H, b
+        H, b, along, moments = np.zeros((12, 12)), np.zeros(12), np.zeros((6, 6)), np.zeros((4, 4))
+        found = _accumulate(
+            self._keys,
+            self._rows,
+            self._planes,
+            points,
+            shares,
+            rotation,
+            position,
+            corrections,
+            gate_m,
+            H,
+            b,
+            along,
+            moments,
         )
-        return H, b, noise, found
+        # errors of a normal are in its plane: those in all directions without those along it
+        unit, across, squares = np.eye(3), np.cross(moments[0, 1:], np.eye(3)), moments[1:, 1:]
+        every = np.block([[moments[0, 0] * unit, across], [across.T, np.trace(squares) * unit - squares]])
+        return H, b, every - along, found
 
 
 def _table(size: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
@@ -110,7 +127,8 @@ def _table(size: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
 @njit(allocates=False)
 def _key(level, x, y, z, side):  # type: ignore[no-untyped-def]
     size = SIZES_M[level]
-    i, j, k = np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.floor(z / size))
+    # the floor, at height 0, is in the middle of its voxels
+    i, j, k = np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.rint(z / size))
     return ((((i + _OFFSET) << 20 | (j + _OFFSET)) << 20 | (k + _OFFSET)) << 3 | level << 1 | side) & 0x7FFFFFFFFFFFFFFF
 
 
@@ -192,7 +210,7 @@ def _fit_planes(stats, planes, rows):  # type: ignore[no-untyped-def]
         C[1, 1], C[1, 2], C[2, 2] = s[7] / n - my * my, s[8] / n - my * mz, s[9] / n - mz * mz
         C[1, 0], C[2, 0], C[2, 1] = C[0, 1], C[0, 2], C[1, 2]
         values, vectors = np.linalg.eigh(C)
-        thin = max(values[0], 0.0)
+        thin = max(values[0], 0.0) + 3.0 * POINT_SIGMA_M**2 / n  # three points always lie in a plane
         if thin > THICKEST_M**2 or thin > _WIDEST_RATIO * values[1]:
             plane[6] = 0.0
             continue
@@ -201,7 +219,7 @@ def _fit_planes(stats, planes, rows):  # type: ignore[no-untyped-def]
             nx, ny, nz = -nx, -ny, -nz
         plane[0], plane[1], plane[2], plane[3], plane[4], plane[5] = nx, ny, nz, mx, my, mz
         plane[6] = POINT_SIGMA_M**2 + thin / n
-        plane[7] = max(thin, 0.25 * POINT_SIGMA_M**2) / (n * values[1])
+        plane[7] = thin / (n * values[1]) + _UNEVEN**2
 
 
 @njit(allocates=False)
@@ -220,9 +238,8 @@ def _surfel(keys, rows, planes, x, y, z, rx, ry, rz):  # type: ignore[no-untyped
 
 
 @njit
-def _accumulate(keys, rows, planes, points, shares, R, t, corrections, gate_m, H, b):  # type: ignore[no-untyped-def]
-    J = np.empty(6)
-    noise, found = 0.0, 0
+def _accumulate(keys, rows, planes, points, shares, R, t, corrections, gate_m, H, b, along, moments):  # type: ignore[no-untyped-def]
+    J, q, found = np.empty(6), np.ones(4), 0
     for p in range(len(points)):
         a = shares[p]
         vx = (1.0 - a) * corrections[0, 0] + a * corrections[1, 0]
@@ -252,13 +269,17 @@ def _accumulate(keys, rows, planes, points, shares, R, t, corrections, gate_m, H
             continue
         found += 1
         weight = 1.0 / (n[6] + r * r / 6.0)  # Cauchy
-        noise += weight * n[7]
         J[0] = R[0, 0] * n[0] + R[1, 0] * n[1] + R[2, 0] * n[2]
         J[1] = R[0, 1] * n[0] + R[1, 1] * n[1] + R[2, 1] * n[2]
         J[2] = R[0, 2] * n[0] + R[1, 2] * n[1] + R[2, 2] * n[2]
         J[3] = y * J[2] - z * J[1]
         J[4] = z * J[0] - x * J[2]
         J[5] = x * J[1] - y * J[0]
+        v = weight * n[7]
+        q[1], q[2], q[3] = x, y, z
+        for i in range(4):
+            for j in range(4):
+                moments[i, j] += v * q[i] * q[j]
         c0, c1 = 1.0 - a, a
         for i in range(6):
             wi = weight * J[i]
@@ -266,8 +287,9 @@ def _accumulate(keys, rows, planes, points, shares, R, t, corrections, gate_m, H
             b[6 + i] += c1 * wi * r
             for j in range(6):
                 v = wi * J[j]
+                along[i, j] += n[7] * v
                 H[i, j] += c0 * c0 * v
                 H[i, 6 + j] += c0 * c1 * v
                 H[6 + i, j] += c0 * c1 * v
                 H[6 + i, 6 + j] += c1 * c1 * v
-    return noise, found
+    return found

@@ -29,10 +29,6 @@ _ON_SURFACE_M, _NEAR_SURFACE_M = 0.06, 0.5
 """Of the points that are near a surface, most are on it if the registration is right."""
 _CORRELATED: Final = 0.25
 """Information of a point: neighbours have the same error of their surface."""
-_NOISE_FACTOR, _NORMAL_VARIANCE = 0.3, 5e-4
-"""Errors of the normals of surfels: factor of what their points show, and variance besides, as no wall is plane."""
-LEVER_M: Final = 5.0
-"""Usual distance of a point: it makes rotations and translations comparable."""
 _POOR_FACTOR, _POOR_LEAST = 3.0, 0.02
 """A registration is poor if more points than the second number, and this many times the usual, miss their surface."""
 SETTLED: Final = 20
@@ -138,7 +134,8 @@ class Tracker3d:
         else:
             sigma_rad = float(np.sqrt(np.trace(self._covariance[3:, 3:]) / 3.0))
             is_fixed = bool(np.linalg.eigvalsh(fit.measured[:3, :3])[0] * 9.0 * predicted.sigma[0] ** 2 > 1.0)
-            self.sensors.learn(predicted, motion, length_s, sigma_rad, is_fixed)
+            moved = se3.between(T_odom_begin, end) if is_fixed else None
+            self.sensors.learn(predicted, motion, moved, length_s, sigma_rad)
         self._turns += 1
         self._T_odom_end, self._end_s = end, begin_s + length_s
         share = -first_s / length_s
@@ -230,7 +227,7 @@ def _fit(
             points, shares, rotation, position, corrections.reshape(2, 6), gate_m
         )
         measured, trusted = without_noise(H[:6, :6] + H[6:, 6:] + H[:6, 6:] + H[6:, :6], noise)
-        H, b = _CORRELATED * (trusted @ H @ trusted.T), _CORRELATED * (trusted @ b)
+        H, b = _CORRELATED * (trusted @ H @ trusted.T), _CORRELATED * (trusted @ trusted @ b)
         step = np.linalg.solve(H + prior, -(b + prior @ corrections))
         corrections = corrections + step
         if gate_m == _GATES_M[-1] and np.abs(step).max() < _CONVERGED:
@@ -242,16 +239,14 @@ def _fit(
     return _Fit(corrections.reshape(2, 6), inverse(H + prior), _CORRELATED * measured, on, on / max(near, 1))
 
 
-def without_noise(information: FloatArray, noise: float) -> tuple[FloatArray, FloatArray]:
-    """Information (6, 6) without the ``noise`` that errors of the normals make, and the factors of the Jacobians of two
-    poses that give it, shape (12, 12)."""
-    scale = np.array([1.0] * 3 + [LEVER_M] * 3)
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    noise = _NOISE_FACTOR * noise + _NORMAL_VARIANCE * float(np.trace(information[:3, :3]))
-    kept = np.maximum(values - noise, 0.0)
-    factors = np.sqrt(kept / np.maximum(values, 1e-9))
-    trusted = (vectors * factors) @ vectors.T * scale[:, None] / scale
-    return (vectors * kept) @ vectors.T * np.outer(scale, scale), np.kron(np.eye(2), trusted)
+def without_noise(information: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Information (6, 6) without the ``noise`` (6, 6) that errors of the normals make, and the factors of the Jacobians
+    of two poses that give it, shape (12, 12)."""
+    root = np.linalg.cholesky(information + 1e-9 * np.trace(information) * np.eye(6))
+    white = np.linalg.inv(root)
+    shares, vectors = np.linalg.eigh(white @ noise @ white.T)
+    trusted = root @ (vectors * np.sqrt(np.maximum(1.0 - shares, 0.0))) @ vectors.T @ white
+    return trusted @ information @ trusted.T, np.kron(np.eye(2), trusted)
 
 
 def inverse(matrix: FloatArray) -> FloatArray:
