@@ -27,6 +27,7 @@ ROOMS = [
     "storage",
     "maps.occupancy_map",
     "maps.ros_map",
+    "graph.evidence",
     "runs",
     "sources",
     "graph",

@@ -175,7 +175,7 @@ def test_edits_show_at_once_a_veto_its_undo_and_a_removed_robot(page, packets, t
             vetoed = page.locator(f'#list tr[data-key="{key}"]')
             until(page, lambda: not vetoed.count() or len(maps(page)) == 2, "the veto")  # noqa: B023
         view(page, "attention")
-        says(page, "#attention", "have separate maps.")
+        says(page, "#verdicts", "has another map")
         page.get_by_role("button", name="Open edits").click()
         tabs = page.locator("#tabs button")
         for number in (1, 0):
@@ -320,6 +320,7 @@ def test_a_robot_is_found_by_its_name_and_a_silent_one_is_named(page, mapped):
 def test_a_report_tells_of_days_of_changes_and_of_accuracy(browser, tmp_path):
     folder = write_run(tmp_path / "building", (0, 1))
     certificate = {"bar": 0.05, "cell": 1.0, "drives": [], "cells": [{"x": 0.0, "y": 0.0, "good": True}] * 3}
+    certificate |= {"within": 10.0, "error_95": 0.03, "good_share": 1.0}
     (folder / "quality.json").write_text(json.dumps({"0": certificate}))
     moved = {"kind": "moved", "start": [-1.0, 0.0], "end": [1.0, 0.0], "length_m": 2.0, "by_m": 0.3}
     plan = {"drawing": "M-2 -2L2 -2z", "maps": [{"map": 0, "aligned": True, "deviations": [moved]}]}
@@ -331,7 +332,7 @@ def test_a_report_tells_of_days_of_changes_and_of_accuracy(browser, tmp_path):
         closing(context.new_page()) as page,
     ):
         page.goto(f"file://{tmp_path / 'report.html'}")
-        says(page, "#accuracy", "3 of 3 m² of the map are accurate to 5 cm.")
+        says(page, "#verdicts", "Use this map.")
         page.locator("#layers summary").click()
         page.wait_for_timeout(500)
         assert pixels(page, [APPEARED]) == [0]
@@ -515,7 +516,7 @@ def test_a_robot_with_a_hostile_name_is_text(page, mapped):
         "robots": [{**robot, "session": evil, "robot": evil, "floor": evil} for robot in ask("robots")],
         "maps": [{**ask("maps")[0], "map": k, "robots": [evil], "floor": evil} for k in (0, 1)],
         "edits": [{**region, "number": 1, "author": evil, "time_s": 1e9, "undone_by": None}],
-        "separations": [{"maps": [0, 1], "candidates": 1, "verified": 0, "reason": None, "explanation": evil}],
+        "verdicts": [{"map": 0, "robots": [evil], "use": "reserve", "sentence": evil, "details": [evil], "where": []}],
         "closures?*": closures,
         "metrics.json": [{"name": evil, "value": 1.0, "unit": evil}],
     }
@@ -524,9 +525,10 @@ def test_a_robot_with_a_hostile_name_is_text(page, mapped):
     page.route("**/api/v1/trajectories/**", lambda route: route.fulfill(body="0 0 0 0 0 0 0 1\n"))
     page.goto(mapped.url)
     says(page, "#robots", evil)
+    says(page, "#verdicts", evil)
     page.get_by_text("All numbers").click()
     says(page, "#metrics", evil)
-    for name, where in {"attention": "#attention", "history": "#events", "edits": "#edits", "files": "#files"}.items():
+    for name, where in {"history": "#events", "edits": "#edits", "files": "#files"}.items():
         view(page, name)
         says(page, where, evil)
     view(page, "evidence")

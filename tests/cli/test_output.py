@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from fcslam.cli import BAD_INPUT, main
-from fcslam.cli.output import new_folder
+from fcslam.cli.output import new_folder, verdict_lines
+from fcslam.runs import open_run
 from tests.sources.carmen_text import drive, save
 
 pytestmark = pytest.mark.slow
@@ -28,8 +29,8 @@ def test_map_makes_a_run_folder_and_prints_where(tmp_path, monkeypatch, capsys):
     save(tmp_path / "robot.log", drive(40))
     for runs in (1, 2):
         assert main(["map", "robot.log"]) == 0
-        last = capsys.readouterr().out.splitlines()[-1]
-        assert Path(last.removeprefix("map: ")).is_file()
+        (picture,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("map: ")]
+        assert Path(picture.removeprefix("map: ")).is_file()
         assert len(list(Path("runs").iterdir())) == runs
 
 
@@ -40,20 +41,23 @@ def test_quiet_map_prints_its_answer_only(tmp_path, capsys):
     assert main(["map", str(log), "-o", str(tmp_path / "run"), "--quiet"]) == 0
     out, error = capsys.readouterr()
     assert error == ""
-    assert out.endswith(f"map: {tmp_path / 'run' / 'map.png'}\n")
+    assert f"map: {tmp_path / 'run' / 'map.png'}\nmap 0 (robot): do not use this map yet: it shows" in out
 
 
-def test_the_last_lines_say_why_maps_are_apart_and_name_every_picture(tmp_path, capsys):
+def test_the_last_lines_are_the_verdict_after_the_names_of_every_picture(tmp_path, capsys):
     logs = [str(save(tmp_path / f"{name}.log", drive(scans))) for name, scans in (("a", 40), ("b", 19))]
     assert main(["map", *logs, "-o", str(tmp_path / "run"), "--quiet"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    after = lines[lines.index("2 maps") + 1 :]
-    assert "no two of their places look alike" in after[0] or after[0].startswith("map 0 (a) and map 1 (b): ")
     pictures = sorted((tmp_path / "run").glob("map*.png"))  # a map of few keyscans gets none
     assert pictures
-    assert after[1:] == [f"map: {path}" for path in pictures]
+    after = lines[lines.index(f"map: {pictures[0]}") :]
+    assert after[: len(pictures)] == [f"map: {path}" for path in pictures]
+    assert after[len(pictures) :] == [*verdict_lines(open_run(tmp_path / "run").verdict)]
+    assert "b has another map" in "\n".join(after)
+    assert main(["evaluate", "quality", str(tmp_path / "run")]) == 0
+    assert capsys.readouterr().out.splitlines() == after[len(pictures) :]
     assert main(["map", *logs, "-o", str(tmp_path / "alone"), "--quiet", "-c", "fleet.join_maps=false"]) == 0
-    assert "2 maps: one for each robot" in capsys.readouterr().out
+    assert "another map" not in capsys.readouterr().out
 
 
 @pytest.mark.attack

@@ -35,8 +35,8 @@ from tests.service.http.desk import A
 pytestmark = pytest.mark.slow
 
 ASKED = (
-    *("fleet", "maps", "separations", "joins", "robots", "edits", "learning"),
-    *("metrics.json", "quality.json", "config.yaml"),
+    *("fleet", "maps", "verdicts", "robots", "edits", "learning"),
+    *("metrics.json", "config.yaml"),
     *(f"closures?status={status}&limit=5000" for status in ClosureStatus),
 )
 """Paths that the page requests, besides events, trajectories and tiles."""
@@ -109,15 +109,17 @@ def test_a_finished_run_answers_as_the_service_does(shown):
     assert metrics == [{"name": "error", "value": None, "unit": "m"}]
     assert one["sessions"] == robots[:2]
     assert [(edit["kind"], edit["author"]) for edit in told["edits"]] == [("veto", "anna")]
-    assert told["joins"] == [  # not of robots in two maps
-        {"robots": ["a", "a+1"], "map": 0, "closures": 3, "places": 1}
-        | dict.fromkeys(("seen_m", "contradicting_m", "likeness", "elsewhere"))
-        | {"explanation": "a and a+1: 3 closures from 1 place; their maps could not be compared"}
+    first, second = told["verdicts"]
+    assert (first["map"], first["use"], first["sentence"]) == (
+        0,
+        "reserve",
+        "use this map, but its accuracy is not known",
+    )
+    assert first["details"] == [
+        "b has another map (no two of their places look alike); drive b through a part of map 0",
+        "joined: a and a+1: 3 closures from 1 place; their maps could not be compared",
     ]
-    (apart,) = told["separations"]
-    assert (apart["maps"], apart["explanation"]) == (
-        [0, 1], "map 0 (a, a+1) and map 1 (b): no two of their places look alike; drive b through a part of map 0"
-    )  # fmt: skip
+    assert (second["use"], second["where"]) == ("wait", [])
 
 
 def test_every_route_of_viewers_answers_for_a_finished_run(shown):
@@ -274,7 +276,11 @@ def test_a_browser_shows_a_report_from_a_file(shown, tmp_path):
     tabs = [text for attributes, text in elements.of("button") if "data-map" in attributes]
     assert tabs == ["a and a+1", "b"]
     states = [text for attributes, text in elements.of("p") if attributes.get("class") == "state"]
-    assert states[:2] == ["Finished, not joined with the others yet"] * 2
+    assert states[:2] == [
+        "Use this map, but its accuracy is not known.",
+        "Do not use this map yet: it shows 4.5 m of path; drive at least 5 m.",
+    ]
+    assert states[2:4] == ["Finished, not joined with the others yet"] * 2
 
 
 def test_a_report_holds_every_path_that_the_page_names():

@@ -38,18 +38,6 @@ def test_the_state_of_a_robot_is_true(told):
         ["ok", "Finished, on the shared map"],
         ["wait", "Finished, not joined with the others yet"],
     ]
-    assert told["evidence"] == ["Nobody else has seen its places yet", "Saw the same places as b, 2 times"]
-
-
-def test_a_robot_names_the_evidence_of_its_weakest_joins(told):
-    join = "Joined with b: 7 places, 141 m of wall seen by both, 0 % contradict."
-    assert told["joins"] == [
-        "",
-        join,
-        "Joined with b: 1 place, 141 m of wall seen by both, 0 % contradict. Look-alike places are possible. "
-        "Joined with b: 9 places, their maps could not be compared.",
-        f"{join} {join} {join} 1 more join, from more places.",
-    ]
 
 
 def test_the_evidence_names_what_it_rests_on(told):
@@ -59,33 +47,18 @@ def test_the_evidence_names_what_it_rests_on(told):
 def test_attention_has_what_needs_a_person_and_is_empty_otherwise(told):
     assert told["well"] == []
     assert told["silent"] == [["a and c have been silent, the first for 2 min.", "Show the robots"]]
-    ((text, advice, why, do),) = told["apart"]
-    assert (text, why, do) == ("a and b have separate maps.", "few points", {"map": 1, "beside": 0})
-    assert "Drive b through an area that a has mapped" in advice
-    assert told["vetoed"] == [{"view": "edits"}]
     assert told["disk"] == ["The disk of the service has 0.4 GB left."]
-    assert told["certificate"] == [
-        [
-            "2 square metres of the map may be off by more than 0.05 m.",
-            "Drive from (1, 2) to (3, 4) again: about 2 m2 more are good then.",
-            {"quality": 0, "marks": [[1, 2], [3, 4]]},
-        ]
-    ]
     assert told["late"] == ["The map lacks the last 2 min: 3 messages of robots, 1 drive among them."]
-    (advice,) = told["lagging"]
-    assert advice.startswith("The map lacks the last 20 s: 3 messages"), (
-        "only a current map can say that they did not meet"
-    )
-    assert told["contradiction"] == [
-        ["What a measured contradicts the other paths.", {"view": "evidence", "robot": "a"}]
-    ]
 
 
-def test_the_accuracy_is_that_of_the_certificate(told):
-    assert told["accuracy"] == [
-        "3 of 4 m² of the map are accurate to 5 cm.",
-        "",
-        "How accurate the map is, its finished run tells: see Download.",
+def test_a_verdict_is_that_of_the_service_and_says_if_the_map_is_behind(told):
+    assert told["verdicts"] == [
+        {"kind": "ok", "text": "Use this map."},
+        {
+            "kind": "alert",
+            "text": "So far: do not use this map yet: it moved. The map lacks the last 20 s: 3 messages of robots, "
+            "1 drive among them.",
+        },
     ]
 
 

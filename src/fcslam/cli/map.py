@@ -22,7 +22,7 @@ from fcslam.cli.options import (
     output_option,
     with_starts,
 )
-from fcslam.cli.output import RUNS, answers, new_folder, notices
+from fcslam.cli.output import RUNS, answers, new_folder, notices, verdict_lines
 from fcslam.cli.warm_up import compiled, cores
 from fcslam.errors import InputError
 
@@ -35,10 +35,6 @@ if TYPE_CHECKING:
     from fcslam.runs import RobotTrajectory, Run
     from fcslam.sources import Source
     from fcslam.sources.faults import Faults
-
-
-MOST_JOINS = 6
-"""Most joins that are printed; all are in joins.csv."""
 
 
 def map_recordings(
@@ -179,7 +175,7 @@ def map_sources(
         display.start("writing")
         run.save(output, force)
     print_faults(console, faults)
-    _report(run, time.perf_counter() - began, output, settings, inputs.onto)
+    _report(run, time.perf_counter() - began, output, inputs.onto)
     return run
 
 
@@ -218,13 +214,11 @@ def _report(
     run: "Run",
     elapsed_s: float,
     output: Path,
-    settings: "MissionConfig",
     earlier: "SavedMission",
 ) -> None:
     from rich.table import Table
 
     from fcslam.anchoring.anchors import anchoring_lines
-    from fcslam.metrics.trajectory import find_jumps
 
     values = {name: metric.value for name, metric in run.metrics.items()}
     has_floors = any(trajectory.floor for trajectory in run.trajectories.values())
@@ -245,25 +239,10 @@ def _report(
         f"{values['inter_robot_closures_accepted']:.0f} between them",
     )
     lines = [*_session_lines(run, earlier)]
-    for trajectory in run.trajectories.values():
-        jumps = find_jumps(trajectory.stamps, trajectory.T_map_base)
-        lines += [f"warning: {trajectory.robot}: {jumps}; check the map there"] if jumps is not None else []
-    maps, joined = int(values["maps"]), settings.fleet.join_maps
-    if maps > 1:
-        lines.append(f"{maps} maps" if joined else f"{maps} maps: one for each robot")
-    lines += [*_join_lines(run), *_separation_lines(run)] if joined else []
     lines += anchoring_lines(run.map_files)
     lines += [f"map: {output / name}" for name in sorted(run.map_files) if name.endswith((".png", ".ply"))]
+    lines += verdict_lines(run.verdict)
     typer.echo("\n".join(lines))
-
-
-def _join_lines(run: "Run") -> Iterator[str]:
-    for join in sorted(run.joins, key=lambda join: join.places)[:MOST_JOINS]:
-        yield str(join)
-    if len(run.joins) > MOST_JOINS:
-        yield f"{len(run.joins) - MOST_JOINS} more joins, from more places: joins.csv"
-    if run.joins:
-        yield "a LiDAR cannot tell exact copies of a wing or floor apart; --floor, --start and tags do"
 
 
 def _session_lines(run: "Run", earlier: "SavedMission") -> Iterator[str]:
@@ -288,15 +267,3 @@ def _session_lines(run: "Run", earlier: "SavedMission") -> Iterator[str]:
             after_s = math.floor(10.0 * (begin_s - first_s.get(robot, begin_s))) / 10.0
             remedy = f"; if it is on another floor then, give --floor {robot}@{after_s:.1f}=FLOOR"
         yield f"{session.robot}: {why}; this session begins at {begin_s:.3f} s{remedy}"
-
-
-def _separation_lines(run: "Run") -> Iterator[str]:
-    """For every two maps, what keeps them apart; maps without similar places share one line."""
-    from fcslam.runs import separations
-
-    apart = separations(run)
-    unlike = [separation for separation in apart if separation.reason is None]
-    for separation in apart if len(unlike) == 1 else (one for one in apart if one not in unlike):
-        yield str(separation)
-    if len(unlike) > 1:
-        yield f"{len(unlike)} pairs of maps: no two of their places look alike"

@@ -1,6 +1,6 @@
 """Where commands write: messages on stderr, answers on stdout, and new folders named by the time."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from itertools import count
 from pathlib import Path
@@ -9,9 +9,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from fcslam.runs import MapVerdict
+
 RUNS, RECORDINGS, FEATURES, TRAINING = "runs", "recordings", "features", "training"
 CHANGES = "changes"
 """Default parents of output folders."""
+MOST_NAMES = 6
+"""Sessions of a map that are named; of more, the number is printed."""
 
 
 def new_folder(parent: str, now: datetime | None = None) -> Path:
@@ -53,3 +57,11 @@ def once_printer(console: "Console") -> Callable[[str], None]:
             print_line(console, line)
 
     return print_once
+
+
+def verdict_lines(verdicts: "Sequence[MapVerdict]") -> "Iterator[str]":
+    """Whether to use each map, and what that rests on."""
+    for one in verdicts:
+        names = f"{len(one.robots)} sessions" if len(one.robots) > MOST_NAMES else ", ".join(one.robots)
+        yield f"map {one.map_index} ({names}): {one}"
+        yield from (f"  {line}" for line in one.details)

@@ -17,7 +17,7 @@ from fcslam.geometry.groups import Group
 from fcslam.graph import cluster
 from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.consistency import Closures
-from fcslam.graph.evidence import ConsistencySettings, MapFit
+from fcslam.graph.evidence import ClusterEvidence, ConsistencySettings, MapFit
 from fcslam.graph.joint import JointEvidence, solve_jointly
 from fcslam.graph.optimizer import INLIER_WEIGHT
 from fcslam.graph.pose_graph import PoseGraph
@@ -114,6 +114,10 @@ def reevaluate(
     T_map_base: dict[str, FloatArray] = {robot: frozen(graph.trajectory(robot)) for robot in robots}
     T_local_base = dict(zip(robots, solution.own, strict=True))
     joins = {frozenset((robots[link.a], robots[link.b])): link.decision.evidence for link in solution.joining}
+    for pair in {frozenset((e.closure.i.robot, e.closure.j.robot)) for e in entries if e.is_certain and e.is_between}:
+        held = [entry.closure for entry in entries if {entry.closure.i.robot, entry.closure.j.robot} == pair]
+        count, (a, b) = sum(closure.status is ClosureStatus.ACCEPTED for closure in held), sorted(pair)
+        joins[pair] = ClusterEvidence(count, count, 1, fit=compare((a, b), T_map_base[a], T_map_base[b]))
     return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in closures), joins)
 
 

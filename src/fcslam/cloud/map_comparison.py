@@ -147,7 +147,7 @@ class MapComparison(Kept):
 
 def _fit(agreement: PlaceAgreement) -> MapFit:
     support, expected, compared_m, contradicting_m = agreement
-    return MapFit(support, expected, -np.inf, compared_m, contradicting_m)
+    return MapFit(support, expected, -np.inf, compared_m, contradicting_m, 0.5 * compared_m)
 
 
 def _between(T_a_i: FloatArray, T_a_b: FloatArray, T_b_j: FloatArray) -> FloatArray:

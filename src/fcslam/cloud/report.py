@@ -1,5 +1,6 @@
 """A fleet's result as a run: trajectories, closures, maps and metrics."""
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from fcslam.maps.joint_voxels import ply_of
 from fcslam.maps.occupancy_map import OccupancyMap, map_stem, map_yaml, pgm_bytes, server_files
 from fcslam.processes import trim_memory
 from fcslam.records import PLACE_CHANNELS, ClosureStatus, FloatArray, LoopClosure, VoxelMap, frozen
-from fcslam.runs import ClosureRow, Join, LocalMap, Metric, RobotTrajectory, Run
+from fcslam.runs import QUALITY, ClosureRow, Join, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
 
@@ -83,7 +84,7 @@ def run_of(
         for name, track in tracks.items()
     }
     fused = dict(fused_maps(result, grid))
-    certificates = _certificates(result, fused) if with_certificates else {}
+    certificates = _certificates(result, fused, grid.robot_radius_m) if with_certificates else {}
     trim_memory()  # dense covariances and pictures are large, and need not be there at the same time
     map_files = _map_files(result, trajectories, fused) | _space_files(result)
     trim_memory()
@@ -102,7 +103,9 @@ def run_of(
             for name, track in tracks.items()
             if with_local_maps
         },
-        quality=_quality(certificates, fused),
+        quality={f"{QUALITY}.json": json.dumps(certificates, separators=(",", ":"), allow_nan=False).encode()}
+        if certificates
+        else {},
     )
 
 
@@ -219,7 +222,9 @@ def _space_files(result: FleetResult) -> dict[str, bytes]:
     return {f"{map_stem(k)}.ply": ply_of(placed) for k, placed in by_map.items() if placed}
 
 
-def _certificates(result: FleetResult, maps: Mapping[int, OccupancyMap]) -> dict[int, dict[str, Any]]:
+def _certificates(
+    result: FleetResult, maps: Mapping[int, OccupancyMap], robot_radius_m: float
+) -> dict[int, dict[str, Any]]:
     from fcslam.maps.certificate import MappedPath, certify  # a live robot has no use for it, and SciPy is large
 
     certificates = {}
@@ -227,16 +232,8 @@ def _certificates(result: FleetResult, maps: Mapping[int, OccupancyMap]) -> dict
         members = [robot for robot in result.robots if robot.map_index == k and len(robot.stamps)]
         if members and fused.cells.any() and (k == 0 or sum(len(robot.stamps) for robot in members) >= LEAST_DRAWN):
             paths = [MappedPath(robot.robot, robot.stamps, robot.T_map_base, robot.variables) for robot in members]
-            certificates[k] = certify(result.graph, paths, fused)
+            certificates[k] = certify(result.graph, paths, fused, robot_radius_m=robot_radius_m)
     return certificates
-
-
-def _quality(certificates: Mapping[int, Mapping[str, Any]], maps: Mapping[int, OccupancyMap]) -> dict[str, bytes]:
-    if not certificates:
-        return {}
-    from fcslam.maps.certificate import quality_files
-
-    return quality_files(certificates, maps)
 
 
 def fused_maps(result: FleetResult, grid: OccupancyConfig) -> Iterator[tuple[int, OccupancyMap]]:

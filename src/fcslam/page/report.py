@@ -29,7 +29,7 @@ from fcslam.maps.tiles import WORLD_M
 from fcslam.mission.mission_file import opened_copy
 from fcslam.page import ASSETS, MODULES
 from fcslam.records import ClosureStatus
-from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES
+from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, TRAJECTORIES
 from fcslam.runs.folder import MISSION
 from fcslam.service.http.app import PREFIX, VIEWER_ROUTERS
 from fcslam.service.http.authentication import Role
@@ -130,12 +130,12 @@ async def report_html(mission: ViewedMission) -> str:
         for one in maps:
             one["zoom"] = _zoom(one["extent"], one["zoom"], MOST_TILES // len(drawn)) if one in drawn else 0
         found = set() if mission.run_folder is None else {path.name for path in mission.run_folder.iterdir()}
-        texts = ["fleet", "separations", "joins", "robots", "edits", "learning"]
+        texts = ["fleet", "verdicts", "robots", "edits", "learning"]
         texts += [f"maps/{one['map']}/layers/{layer}" for one in maps for layer in one["layers"]]
         texts += [f"closures?status={status}&limit={MOST_CLOSURES}" for status in ClosureStatus]
         texts += [f"maps/{one['map']}/walls" for one in drawn]
         texts += [f"{TRAJECTORIES}/{quote(one['session'], safe='')}.tum" for one in robots if one["T_map_base"]]
-        texts += sorted(found & {METRICS, CONFIG, f"{QUALITY}.json"})
+        texts += sorted(found & {METRICS, CONFIG})
         for one in maps:
             one["in_space"] = one["in_space"] and len(await get(f"maps/{one['map']}.ply")) <= MOST_POINTS_BYTES
         files = [f"maps/{one['map']}.png" for one in drawn if f"{map_stem(one['map'])}.png" in found]

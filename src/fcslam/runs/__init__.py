@@ -5,7 +5,6 @@ from fcslam.runs.folder import (
     LOCAL,
     METRICS,
     POSE_GRAPH,
-    QUALITY,
     TRAJECTORIES,
     Run,
     check_names,
@@ -15,6 +14,7 @@ from fcslam.runs.folder import (
 from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, LocalMap, Metric, RobotTrajectory
 from fcslam.runs.separations import Separation, separations
 from fcslam.runs.tables import metrics_json, read_tum, write_tum
+from fcslam.runs.verdict import QUALITY, MapVerdict, Use
 
 __all__ = [
     "CONFIG",
@@ -27,10 +27,12 @@ __all__ = [
     "Join",
     "LocalMap",
     "LocalizedPoses",
+    "MapVerdict",
     "Metric",
     "RobotTrajectory",
     "Run",
     "Separation",
+    "Use",
     "check_names",
     "metrics_json",
     "open_run",

@@ -7,7 +7,7 @@
     pose_graph.g2o             the optimized pose graph
     metrics.json               [{name, value, unit}]
     config.yaml                the complete configuration of the run
-    quality.json, .png         the certificate: expected error of each square metre, open stretches, what to drive again
+    quality.json               the certificate: expected error of each square metre, what to drive
     mission.fcslam             packets, edits and configuration of the mission, with which it can go on
     map.ply                    of robots with 3D LiDARs: points with normals, coloured by height
     map.pgm, map.yaml ...      map files, map_<k>.* for robots not connected to the first map
@@ -31,7 +31,7 @@ from pathlib import Path
 from fcslam.errors import InputError
 from fcslam.maps.occupancy_map import RMF_YAML, OccupancyMap, parse_map
 from fcslam.records import StrPath
-from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, LocalMap, Metric, RobotTrajectory
+from fcslam.runs.records import LocalizedPoses, LocalMap, RobotTrajectory, RunTables
 from fcslam.runs.tables import (
     in_plane,
     metrics_json,
@@ -48,14 +48,13 @@ from fcslam.runs.tables import (
     write_robots,
     write_tum,
 )
+from fcslam.runs.verdict import QUALITY, MapVerdict, verdicts
 from fcslam.storage.files import bring_back, replacing_folder
 from fcslam.untrusted import read_bytes, read_text
 
 TRAJECTORIES, LOCAL, ROBOTS, CLOSURES, JOINS = "trajectories", "local", "robots.csv", "closures.csv", "joins.csv"
 LOCALIZATION, MISSION = "localization", "mission.fcslam"
 METRICS, CONFIG, POSE_GRAPH = "metrics.json", "config.yaml", "pose_graph.g2o"
-QUALITY = "quality"
-"""Beginning of the names of the certificate's files: ``quality.json``, and a picture of each map."""
 
 _SAFE_NAME = re.compile(r"\w[\w.+-]*")
 _MAP_FILE = re.compile(r"map(?:_([1-9]\d{0,8}))?\.pgm")
@@ -63,7 +62,7 @@ _MAP_FILE = re.compile(r"map(?:_([1-9]\d{0,8}))?\.pgm")
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Run(RunTables):
     """The result of a mission: what ``fcslam.map_recordings`` returns and ``fcslam.open_run`` reads.
 
     Poses are (x, y, theta) of the robot's ``base`` in metres and radians; ``T_a_b`` maps coordinates in b to a. Robots
@@ -71,16 +70,6 @@ class Run:
     Files hold poses and stamps with nine digits after the decimal point and closures with six.
     """
 
-    trajectories: Mapping[str, RobotTrajectory]
-    """By robot."""
-    closures: tuple[ClosureRow, ...] = ()
-    """Every loop closure considered between robots and every one within a robot, with its status and the reason."""
-    joins: tuple[Join, ...] = ()
-    """On what evidence robots share a map, for each two with closures between them that agree."""
-    metrics: Mapping[str, Metric] = field(default_factory=dict)
-    """By name."""
-    config_yaml: str = ""
-    """The complete configuration."""
     pose_graph_g2o: str = ""
     """All keyscans at their optimized poses with the constraints in use, in the g2o format."""
     map_files: Mapping[str, bytes] = field(default_factory=dict)
@@ -88,8 +77,7 @@ class Run:
     local_maps: Mapping[str, LocalMap] = field(default_factory=dict)
     """By robot: every robot's own map. Live results of the service have none, and their folder has no ``local``."""
     quality: Mapping[str, bytes] = field(default_factory=dict)
-    """File name to content: quality.json and a picture of each map. How good the maps are where; live results of the
-    service have none."""
+    """File name to content: quality.json, how good the maps are where."""
     mission: bytes = b""
     """The mission file: packets and edits, with which the mission can go on. Live results of the service have none."""
     localized: Mapping[str, LocalizedPoses] = field(default_factory=dict)
@@ -104,6 +92,11 @@ class Run:
                 description = self.map_files.get(f"{name.removesuffix('.pgm')}.yaml", b"").decode(errors="replace")
                 decoded[int(match[1] or 0)] = parse_map(name, pgm, description)
         return dict(sorted(decoded.items()))
+
+    @cached_property
+    def verdict(self) -> tuple[MapVerdict, ...]:
+        """Whether to use each map, and why. Decided at the first use."""
+        return verdicts(self, self.quality)
 
     def save(self, folder: StrPath, force: bool = False) -> None:
         """Write the run folder, whole or not at all.
@@ -178,7 +171,6 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
     try:
         robots = read_robots(path / ROBOTS, path)
         pictures = [*path.glob("map*.*"), *path.glob("plan.*"), *path.glob(RMF_YAML)]
-        certificates = path.glob(f"{QUALITY}*.*")
         own_maps = robots if maps and (path / LOCAL).exists() else ()
         return Run(
             trajectories={robot: _read_trajectory(path, robot, *where) for robot, where in robots.items()},
@@ -189,7 +181,7 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
             pose_graph_g2o=read_text(path / POSE_GRAPH, path) if maps else "",
             map_files={file.name: read_bytes(file, path) for file in sorted(pictures) if maps},
             local_maps={robot: _read_local_map(path, robot) for robot in own_maps},
-            quality={file.name: read_bytes(file, path) for file in sorted(certificates) if maps},
+            quality={file.name: read_bytes(file, path) for file in path.glob(f"{QUALITY}.json")},
             mission=read_bytes(path / MISSION, path) if maps and (path / MISSION).exists() else b"",
             localized={file.stem: read_localized(file, path) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
         )

@@ -1,7 +1,8 @@
 """Records of a run. Arrays in them are read-only."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,3 +150,19 @@ class Metric:
     """NaN: there is nothing to measure."""
     unit: str
     """``1`` for counts and ratios."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunTables:
+    """The tables of a run."""
+
+    trajectories: Mapping[str, RobotTrajectory]
+    """By robot."""
+    closures: tuple[ClosureRow, ...] = ()
+    """Every loop closure considered between robots and every one within a robot, with its status and the reason."""
+    joins: tuple[Join, ...] = ()
+    """On what evidence robots share a map, for each two with closures between them that agree."""
+    metrics: Mapping[str, Metric] = field(default_factory=dict)
+    """By name."""
+    config_yaml: str = ""
+    """The complete configuration."""

@@ -7,8 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from fcslam.records import ClosureStatus, Reason, ReasonCode
-from fcslam.runs.folder import Run
-from fcslam.runs.records import ClosureRow
+from fcslam.runs.records import ClosureRow, RunTables
 
 _GATES = (
     ReasonCode.ASYMMETRIC,
@@ -44,20 +43,31 @@ class Separation:
     near: tuple[float, float] | None = None
     """Where a closure that failed by it ends in the first map, metres."""
 
+    @property
+    def why(self) -> str:
+        """What keeps the maps apart, a clause."""
+        if self.reason is None:
+            return "no two of their places look alike"
+        has = _count(self.verified, "verified closure") if self.verified else _count(self.candidates, "candidate")
+        return f"{has}, {'but' if self.verified else 'none verified:'} {replace(self.reason, setting='')}"
+
+    @property
+    def remedy(self) -> str:
+        """What to drive so that the maps may join; empty if no drive helps."""
+        driver, k = self.robots[1][0], self.maps[0]
+        if self.reason is None:
+            return f"drive {driver} through a part of map {k}"
+        if self.near is None or self.reason.code in _FINAL:
+            return ""
+        x, y = self.near
+        return f"drive {driver} through map {k} around ({x:.1f}, {y:.1f}) again, and beyond"
+
     def __str__(self) -> str:
         first, second = (f"map {k} ({', '.join(robots)})" for k, robots in zip(self.maps, self.robots, strict=True))
-        apart, driver = f"{first} and {second}", self.robots[1][0]
-        if self.reason is None:
-            return f"{apart}: no two of their places look alike; drive {driver} through a part of map {self.maps[0]}"
-        has = _count(self.verified, "verified closure") if self.verified else _count(self.candidates, "candidate")
-        why = f"{apart}: {has}, {'but' if self.verified else 'none verified:'} {replace(self.reason, setting='')}"
-        if self.near is None or self.reason.code in _FINAL:
-            return why
-        x, y = self.near
-        return f"{why}; drive {driver} through map {self.maps[0]} around ({x:.1f}, {y:.1f}) again, and beyond"
+        return f"{first} and {second}: {self.why}" + (f"; {self.remedy}" if self.remedy else "")
 
 
-def separations(run: Run) -> list[Separation]:
+def separations(run: RunTables) -> list[Separation]:
     """One record for every two maps of one floor, in the order of their numbers; none if no maps were to be joined."""
     if _JOINS_NONE in run.config_yaml:
         return []
@@ -77,7 +87,7 @@ def separations(run: Run) -> list[Separation]:
 
 
 def _separation(
-    run: Run, maps: tuple[int, int], robots: tuple[tuple[str, ...], tuple[str, ...]], closures: list[ClosureRow]
+    run: RunTables, maps: tuple[int, int], robots: tuple[tuple[str, ...], tuple[str, ...]], closures: list[ClosureRow]
 ) -> Separation:
     verified = [closure for closure in closures if closure.status is not ClosureStatus.CANDIDATE]
     candidates = len(closures) - len(verified)
@@ -87,7 +97,7 @@ def _separation(
     return Separation(maps, robots, candidates, len(verified), closure.reason, _end_in(run, closure, robots[0]))
 
 
-def _end_in(run: Run, closure: ClosureRow, robots: tuple[str, ...]) -> tuple[float, float]:
+def _end_in(run: RunTables, closure: ClosureRow, robots: tuple[str, ...]) -> tuple[float, float]:
     """Position of the closure's end on the path of one of the robots."""
     ends = ((closure.robot_i, closure.stamp_i), (closure.robot_j, closure.stamp_j))
     robot, stamp = next(end for end in ends if end[0] in robots)

@@ -64,7 +64,7 @@ class QualityReply(_Reply):
     """How good a map is, by its certificate."""
 
     map_index: int = Field(alias="map", description="number of the map")
-    verdict: str = Field(description="how much of it is good")
+    verdict: str = Field(description="whether to use it, why, and what to do next")
     bar_m: float = Field(
         alias="bar", description="a cell is good if its error stays below this in 95 % of cells, metres"
     )
@@ -73,7 +73,7 @@ class QualityReply(_Reply):
         alias="error_95", description="error that 95 % of cells stay below, metres; null: no cell is known"
     )
     good_share: float | None = Field(description="share of good cells")
-    drives: tuple[str, ...] = Field(description="what to drive again, that with the largest gain first")
+    drives: tuple[str, ...] = Field(description="what to do about it, the most urgent first")
 
 
 class ServedMap(_Reply):

@@ -298,22 +298,3 @@ def test_a_map_is_read_as_map_server_reads_it(tmp_path):
     negated = (tmp_path / "map.yaml").read_text().replace("negate: 0", "negate: 1")
     (tmp_path / "map.yaml").write_text(negated)
     assert np.array_equal(read_grid(tmp_path / "map.yaml").free, occupied)
-
-
-def test_a_certificate_is_told_by_map(tmp_path, capsys):
-    stretch = {"robot": "a", "length": 4.0, "from": [0, 0], "to": [4, 0]}
-    one = {
-        "verdict": "2 of 3 m2 are good to 0.05 m within 10 m",
-        "open_stretches": [stretch], "drives": [{"text": "drive there again"}],
-    }  # fmt: skip
-    trajectories = {"a": RobotTrajectory("a", 0, frozen(stamps(0)), frozen(truth(0)))}
-    Run(trajectories, quality={"quality.json": json.dumps({"0": one}).encode()}).save(tmp_path / "run")
-    assert main(["evaluate", "quality", str(tmp_path / "run")]) == 0
-    told = capsys.readouterr().out
-    assert told.startswith("map 0: 2 of 3 m2 are good to 0.05 m within 10 m\nmap 0: open: a for 4 m")
-    assert told.endswith("map 0: drive there again\n")
-    for content, complaint in (("[]x", "is broken"), ("7", "is broken"), (None, "has no quality.json")):
-        file = tmp_path / "run" / "quality.json"
-        file.unlink() if content is None else file.write_text(content)
-        assert main(["evaluate", "quality", str(tmp_path / "run")]) == 2
-        assert complaint in capsys.readouterr().err

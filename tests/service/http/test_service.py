@@ -272,17 +272,15 @@ def test_a_closure_is_shown_with_what_both_robots_saw_until_it_is_gone(mapped):
 def test_a_vetoed_closure_says_so_and_the_maps_come_apart_with_a_reason(mapped):
     closures = get(mapped, "closures?status=accepted").json()
     between = [closure for closure in closures if closure["robot_i"] != closure["robot_j"]]
-    assert get(mapped, "separations").json() == []
-    (join,) = get(mapped, "joins").json()
-    assert (join["robots"], join["map"]) == (["a", "b"], 0)
-    assert 3 <= join["closures"] <= len(between)  # those that joined the maps, and not later ones
+    (verdict,) = get(mapped, "verdicts").json()
+    assert (verdict["robots"], verdict["map"]) == (["a", "b"], 0)
+    assert verdict["details"][0].startswith("joined: a and b: ")
     assert edit(mapped, "veto", {"robot_i": "a", "robot_j": "b"}).status_code == 201
     now = get(mapped, picture_of(between[0])).json()
     assert (now["reason"], now["explanation"]) == ("vetoed", "vetoed by hand")
-    (apart,) = get(mapped, "separations").json()
-    assert (apart["maps"], apart["verified"]) == ([0, 1], len(between))
-    assert "vetoed by hand" in apart["explanation"]
-    assert get(mapped, "joins").json() == []
+    first, second = (one["sentence"] for one in get(mapped, "verdicts").json())
+    assert f"b has another map ({len(between)} verified closures, but vetoed by hand)" in first
+    assert "a has another map" in second
     (made,) = get(mapped, "edits").json()
     assert (made["kind"], made["author"], made["undone_by"]) == ("veto", "boss", None)
 

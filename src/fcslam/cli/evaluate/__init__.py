@@ -1,14 +1,12 @@
 """`fcslam evaluate`: measure runs against references."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from fcslam.cli.options import Csv
-from fcslam.cli.output import notices
-from fcslam.errors import InputError
+from fcslam.cli.output import notices, verdict_lines
 
 RunFolder = Annotated[Path, typer.Argument(help="Run folder to measure.")]
 
@@ -67,22 +65,7 @@ def relations(
 
 @app.command()
 def quality(run: RunFolder) -> None:
-    """Print how good the maps of a run are, by its certificate, and what to drive again."""
-    from fcslam.runs import QUALITY, open_run
+    """Print whether to use each map of a run, why, and what to drive next."""
+    from fcslam.runs import open_run
 
-    content = open_run(run).quality.get(f"{QUALITY}.json")
-    if content is None:
-        raise InputError(f"{run}: has no {QUALITY}.json; map the recordings again with this version")
-    try:
-        certificates = dict(json.loads(content))
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{run}: {QUALITY}.json is broken ({error})") from error
-    for k, one in certificates.items():
-        typer.echo(f"map {k}: {one['verdict']}")
-        for stretch in one["open_stretches"]:
-            typer.echo(
-                f"map {k}: open: {stretch['robot']} for {stretch['length']:g} m from {stretch['from']} to "
-                f"{stretch['to']}; the scans do not fix the motion along it"
-            )
-        for drive in one["drives"]:
-            typer.echo(f"map {k}: {drive['text']}")
+    typer.echo("\n".join(verdict_lines(open_run(run, maps=False).verdict)))

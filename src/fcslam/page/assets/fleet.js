@@ -5,7 +5,7 @@ import { Outdated, ask, at, json, report, unlessSame } from "./service.js";
 const MOST_CLOSURES = 5000; // that the page asks for
 
 export const fleet = {
-  counts: null, mission: null, robots: [], maps: [], separations: [], joins: [], quality: {}, edits: [], regions: [], accepted: [], contradicted: [],
+  counts: null, mission: null, robots: [], maps: [], verdicts: [], edits: [], regions: [], accepted: [],
   trails: new Map(), until: Infinity, // the moment that the map shows: paths and evidence until then
   selected: null, scan: null, readOnly: false, mayEdit: false, readAt: 0,
 };
@@ -54,19 +54,16 @@ export async function update(forget) {
   const counts = await json("fleet");
   release ??= counts.version;
   if (counts.version !== release) { at("reload").hidden = false; throw new Outdated("The service has another version: reload the page."); }
-  const certificate = counts.read_only ? json("quality.json").catch(() => ({})) : {}; // of finished runs
-  const [quality, maps, separations, joins, robots, closed, edits] = await Promise.all(
-    [certificate, json("maps"), json("separations"), json("joins").catch(() => []), json("robots"), listedClosures("accepted"), json("edits")]);
+  const [maps, verdicts, robots, closed, edits] = await Promise.all(
+    [json("maps"), json("verdicts"), json("robots"), listedClosures("accepted"), json("edits")]);
   if (fleet.mission !== null && counts.mission !== fleet.mission) { received.clear(); forget(); }
   const seen = robots.filter((r) => r.map !== null), paths = await Promise.all(seen.map((r) => trail(r.session)));
   const isPlaced = closed === placedNow && seen.length === fleet.trails.size && seen.every((r, i) => paths[i] === fleet.trails.get(r.session) && r.map === robotNamed(r.session)?.map);
-  Object.assign(fleet, { counts, mission: counts.mission, maps, separations, joins, quality, robots, edits, readOnly: counts.read_only, mayEdit: counts.may_edit, readAt: Date.now() });
+  Object.assign(fleet, { counts, mission: counts.mission, maps, verdicts, robots, edits, readOnly: counts.read_only, mayEdit: counts.may_edit, readAt: Date.now() });
   fleet.trails = new Map(seen.map((r, i) => [r.session, paths[i]]));
   if (!isPlaced) fleet.accepted = closed.map(placed);
   placedNow = closed;
   fleet.regions = edits.filter((e) => e.kind === "region" && !e.undone_by).map((e) => e.content);
-  const contested = ["rejected", "revoked"].filter((status) => counts.metrics[`inter_robot_closures_${status}`]);
-  fleet.contradicted = (await Promise.all(contested.map(closures))).flat();
 }
 
 // Poses and times are newer than the map: the service knows them from the packets.

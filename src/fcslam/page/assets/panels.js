@@ -6,7 +6,7 @@ import { heightText } from "./heights.js";
 import { chart, choose, fit, goTo, openMap, redraw, showLayers } from "./map.js";
 import { ask, at, json, link, report } from "./service.js";
 import { change, tell } from "./tools.js";
-import { accuracy, attention, count, dayOf, decisionOf, duration, editOf, evidence, history, joinsOf, lackOf, listed, metres, moment, sensorOf, stateOf } from "./words.js";
+import { attention, count, dayOf, decisionOf, duration, editOf, history, lackOf, listed, metres, moment, sensorOf, stateOf, verdictOf } from "./words.js";
 
 const LISTED = 200; // rows of the table of evidence
 const NEAR_M = 5; // pairs with both ends so near each other show the same place
@@ -97,27 +97,45 @@ export function showAge() {
 
 const cards = new Map();
 function cardOf(name) {
-  const card = element("li"), state = element("p", "", { className: "state" }), seen = element("p"), joined = element("p"), more = element("details"), facts = element("p"), earlier = element("ul");
+  const card = element("li"), state = element("p", "", { className: "state" }), more = element("details"), facts = element("p"), earlier = element("ul");
   const choice = button("", () => { const isNew = fleet.selected !== name; if (isNew) showRobot(name); else select(name); }, { className: "name" });
   more.append(element("summary", "Details"), facts, earlier);
-  card.append(choice, state, seen, joined, more);
-  cards.set(name, { card, choice, state, seen, joined, facts, earlier });
+  card.append(choice, state, more);
+  cards.set(name, { card, choice, state, facts, earlier });
   return cards.get(name);
 }
 export function forgetCards() { cards.clear(); }
 
-let evidenceNow = {};
+// The decision about each map, and what it rests on.
+function showVerdicts() {
+  const { verdicts, counts, readOnly } = fleet, lack = readOnly || !counts ? "" : lackOf(counts);
+  fill(at("verdicts"), [verdicts, lack], () => verdicts.map((one) => {
+    const { kind, text } = verdictOf(one, lack), card = element("li"), why = element("details", element("summary", "Why"));
+    card.dataset.kind = kind;
+    if (verdicts.length > 1) card.append(element("h3", `Map of ${listed(one.robots)}`));
+    card.append(element("p", text, { className: "state" }));
+    if (one.where.length) card.append(button("Show where", () => showPlaces(one.map, one.where)));
+    why.append(...one.details.map((line) => element("p", line)));
+    if (one.details.length) card.append(why);
+    return card;
+  }));
+}
+// Places of a map, on the layer of its accuracy.
+function showPlaces(map, places) {
+  at("layer-quality").checked = true;
+  choose(map); showMaps();
+  chart.marks = places;
+  goTo(middle(places));
+}
+
 export function showFleet() {
   const newest = fleet.robots.filter((r) => !fleet.robots.some((o) => o.robot === r.robot && o.epoch > r.epoch)), list = at("robots");
-  if (evidenceNow.accepted !== fleet.accepted) evidenceNow = { accepted: fleet.accepted, words: evidence(fleet.robots, fleet.accepted) };
   const shown = newest.map((robot) => {
-    const { card, choice, state, seen, joined, facts, earlier } = cards.get(robot.session) ?? cardOf(robot.session), { kind, text } = stateOf(robot, fleet.robots, fleet.readOnly);
+    const { card, choice, state, facts, earlier } = cards.get(robot.session) ?? cardOf(robot.session), { kind, text } = stateOf(robot, fleet.robots, fleet.readOnly);
     fill(choice, [robot.robot, robot.color], () => [swatch(robot.color), robot.robot]);
     choice.ariaPressed = String(robot.session === fleet.selected);
     card.dataset.kind = kind;
     state.textContent = text;
-    seen.textContent = newest.length > 1 && robot.map !== null ? evidenceNow.words.get(robot.session) : "";
-    joined.textContent = joinsOf(robot, fleet.robots, fleet.joins);
     const heard = fleet.readOnly || robot.last_heard_s === null ? [] : [`heard ${duration(robot.last_heard_s)} ago`], sent = fleet.counts.metrics[`uplink_bytes_${robot.robot}`];
     const parts = [`drove ${metres(robot.path_length_m)}`, `${count(robot.keyscans, "scan")} on the map`, ...(robot.z_m === null ? [] : [`height ${heightText(robot.z_m)}`]), ...(robot.floor ? [`floor ${robot.floor}`] : []), ...(sent ? [`${(sent / 1000).toLocaleString("en", { maximumFractionDigits: 0 })} kB sent`] : []), ...heard];
     facts.textContent = `${parts.join("; ")}. ${Object.entries(robot.detectors).map(([channel, made]) => `Detector (${channel}): ${made}.`).join(" ")}`;
@@ -128,39 +146,22 @@ export function showFleet() {
   if (shown.length !== list.children.length || shown.some((card, k) => card !== list.children[k])) list.replaceChildren(...shown);
   const { maps } = fleet, extent = maps.length === 1 && maps[0].extent, size = extent ? `, ${(extent[2] - extent[0]).toFixed(0)} × ${(extent[3] - extent[1]).toFixed(0)} m` : "";
   at("summary").textContent = newest.length ? `${count(newest.length, "robot")} on ${maps.length === 1 ? `one map${size}` : count(maps.length, "map")}` : "No robot yet";
-  at("accuracy").textContent = accuracy(fleet);
+  showVerdicts();
 }
 
 export function showAttention() {
   const found = fleet.counts ? attention(fleet) : [];
   at("needs").hidden = !found.length;
   at("needs").textContent = found.length;
-  fill(at("attention"), found.map((one) => [one.text, one.help, one.why]), () => found.length ? found.map((one) => {
+  fill(at("attention"), found.map((one) => [one.text, one.help]), () => found.length ? found.map((one) => {
     const card = element("li", element("p", one.text, { className: "state" })), act = one.do;
     card.dataset.kind = one.kind;
     card.append(element("p", one.help), button(one.action, () => {
-      if (act.robot && !act.view) showRobot(act.robot);
-      if (act.map !== undefined) besideEachOther(act);
-      if (act.quality !== undefined) showQuality(act);
-      if (act.view) { if (act.robot) at("of-robot").value = act.robot; if (act.view === "evidence") { at("decision").value = "rejected"; at("two-robots").checked = false; } show(act.view); }
+      if (act.robot) showRobot(act.robot);
+      if (act.view) show(act.view);
     }));
-    if (one.why) { const why = element("details", element("summary", "Why")); why.append(element("p", one.why)); card.append(why); }
     return card;
-  }) : [element("li", "All well. Nothing needs you.", { className: "well" })]);
-}
-// The certificate of a map, and the places between which to drive again.
-function showQuality({ quality, marks }) {
-  at("layer-quality").checked = true;
-  choose(quality); showMaps();
-  chart.marks = marks;
-  redraw();
-}
-// Two maps that are apart, side by side: the distance between them means nothing.
-function besideEachOther({ map, beside }) {
-  choose(beside);
-  const [first, second] = [beside, map].map((k) => fleet.maps.find((m) => m.map === k)?.extent);
-  if (first && second) { chart.beside = { map, pose: [first[2] - second[0] + 2, first[1] - second[1], 0] }; fit(); }
-  showMaps();
+  }) : [element("li", "No robot needs you. Whether to use the map is under Fleet.", { className: "well" })]);
 }
 
 // ---- Evidence ----

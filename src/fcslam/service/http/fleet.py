@@ -1,4 +1,4 @@
-"""Routes of viewers about the fleet: robots, closures, joins, edits, learning, and the stream of events."""
+"""Routes of viewers about the fleet: robots, closures, edits, learning, and the stream of events."""
 
 import asyncio
 import csv
@@ -15,7 +15,6 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Depends, HTTPException, Query, Request
 from fastapi import Path as PathParameter
 from fastapi.responses import Response, StreamingResponse
-from pydantic import Field
 
 import fcslam
 from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
@@ -31,8 +30,8 @@ from fcslam.service.http.responses import (
     EditSummary,
     FleetSummary,
     LearningRound,
-    MapJoin,
     PacketRefusal,
+    Point,
     RobotSummary,
     SessionSummary,
     file_of,
@@ -58,7 +57,6 @@ _LOSS = "loss_"
 _MEASURES = ("repeatability", "mma_3px", "revisit_recall", "places_found")
 _CLOSURE = "/closures/{channel}/{robot_i}/{stamp_i}/{robot_j}/{stamp_j}"
 
-Point = Annotated[list[float], Field(min_length=2, max_length=2, description="x and y in metres")]
 Stamp = Annotated[float, PathParameter(allow_inf_nan=False, description="of a keyscan, seconds")]
 
 
@@ -136,25 +134,6 @@ def fleet_router(state: ViewerState) -> APIRouter:
     def get_closure(closure: Annotated[ClosureRow, Depends(closure_of)]) -> ClosureSummary:
         """One closure as it is now."""
         return _closure_summary(closure)
-
-    @router.get("/joins")
-    def get_joins() -> list[MapJoin]:
-        """On what evidence robots share a map, for every two with closures between them that agree."""
-        run = run_of(state.mission)
-        maps = {robot.robot: robot.map_index for robot in run.trajectories.values()}
-        measures = "seen_m", "contradicting_m", "likeness", "elsewhere"
-        return [
-            response_of(
-                MapJoin,
-                join,
-                robots=(join.robot_i, join.robot_j),
-                map=maps[join.robot_i],
-                explanation=str(join),
-                **{name: _finite(getattr(join, name)) for name in measures},
-            )
-            for join in run.joins
-            if maps.get(join.robot_i, -1) == maps.get(join.robot_j)
-        ]
 
     @router.get("/robots/{robot}/scans/{epoch}", responses=refusals(400, 404))
     def get_scan(robot: Name, epoch: Annotated[int, PathParameter(ge=0, le=MAXIMUM_EPOCH)]) -> list[Point]:

@@ -15,20 +15,18 @@ from starlette.concurrency import run_in_threadpool
 
 from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.config import StrictModel
+from fcslam.errors import InputError
 from fcslam.maps.joint_tiles import LARGEST_ANSWER
 from fcslam.maps.occupancy_map import FARTHEST_M
 from fcslam.records import NAME
 from fcslam.runs import QUALITY, Run, separations
-from fcslam.runs.folder import identity
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
 from fcslam.service.http.responses import file_of, refusals
 from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
 from fcslam.service.joint_maps import Exploration, ServedJointMaps
-from fcslam.service.map_layers import MOST_LAYER_BYTES
 from fcslam.service.viewed_mission import run_of, viewed_run
-from fcslam.untrusted import read_text
 from fcslam.wire.fleet_replies import Apart, FleetReply, FrontierReply, MapFrontiers, QualityReply, TeammatePose
 
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False, strict=True)]
@@ -144,18 +142,22 @@ def _maps_of(folder: Path, robot: str | None) -> set[int]:
 def _qualities(folder: Path) -> tuple[QualityReply, ...]:
     """The certificates of the run in a folder; none before there are some, and while it is replaced."""
     try:
-        return _certified(folder, identity(folder))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        run = viewed_run(folder)
+        certificates = json.loads(run.quality[f"{QUALITY}.json"])
+        return tuple(
+            QualityReply.model_validate(
+                {
+                    **certificates[str(one.map_index)],
+                    "map": one.map_index,
+                    "verdict": str(one),
+                    "drives": [concern.remedy for concern in one.concerns if concern.remedy],
+                }
+            )
+            for one in run.verdict
+            if str(one.map_index) in certificates
+        )
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, InputError):
         return ()
-
-
-@lru_cache(maxsize=2)
-def _certified(folder: Path, _: tuple[int, int]) -> tuple[QualityReply, ...]:
-    content = json.loads(read_text(folder / f"{QUALITY}.json", folder, MOST_LAYER_BYTES))
-    return tuple(
-        QualityReply.model_validate({**one, "map": int(k), "drives": [drive["text"] for drive in one["drives"]]})
-        for k, one in content.items()
-    )
 
 
 def _summaries(explored: Exploration, robot: str | None) -> Iterator[FrontierReply]:

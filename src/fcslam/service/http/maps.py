@@ -16,13 +16,13 @@ from fcslam.errors import InputError
 from fcslam.maps.exports import earth_frame, export_map, zipped
 from fcslam.maps.occupancy_map import HEADER_BYTES, area_of, map_stem
 from fcslam.maps.tiles import DEEPEST_ZOOM, finest_zoom, tile_png
-from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES, separations
+from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES
 from fcslam.service.http.authentication import VIEWERS
 from fcslam.service.http.responses import (
     MapLayer,
-    MapSeparation,
     MapShape,
     MapSummary,
+    MapVerdictSummary,
     file_of,
     refusals,
     response_of,
@@ -87,14 +87,18 @@ def map_router(state: ViewerState) -> APIRouter:
             for k, floor in sorted({robot.map_index: robot.floor for robot in robots}.items())
         ]
 
-    @router.get("/separations")
-    def get_separations() -> list[MapSeparation]:
-        """Why maps of one floor are separate, for every two of them."""
+    @router.get("/verdicts")
+    def get_verdicts() -> list[MapVerdictSummary]:
+        """Whether to use each map, why, and what to do next."""
         return [
             response_of(
-                MapSeparation, one, reason=None if one.reason is None else one.reason.code, explanation=str(one)
+                MapVerdictSummary,
+                one,
+                map=one.map_index,
+                sentence=str(one),
+                where=one.concerns[0].where if one.concerns else (),
             )
-            for one in separations(run_of(state.mission))
+            for one in run_of(state.mission).verdict
         ]
 
     @router.get("/maps/{k}.{suffix}", **file_of(*MEDIA.values(), refused=(400, 404), is_tagged=True))

@@ -11,8 +11,10 @@ from starlette.responses import Response
 
 from fcslam.config import StrictModel
 from fcslam.records import Channel, ClosureStatus, ReasonCode
+from fcslam.runs import Use
 
 _Model = TypeVar("_Model", bound=StrictModel)
+Point = Annotated[list[float], Field(min_length=2, max_length=2, description="x and y in metres")]
 Pose = Annotated[list[float], Field(min_length=3, max_length=3, description="x and y in metres, theta in radians")]
 
 
@@ -172,33 +174,15 @@ class MapShape(StrictModel):
     y: float = Field(default=0.0, description="of the label, metres of the map")
 
 
-class MapSeparation(StrictModel):
-    """Two maps that no closure joins."""
+class MapVerdictSummary(StrictModel):
+    """Whether to use one map, and why."""
 
-    maps: tuple[int, int] = Field(description="numbers of both maps")
-    candidates: int = Field(description="number of closures between them that failed verification")
-    verified: int = Field(description="number of closures between them that passed it, and were not enough")
-    reason: ReasonCode | None = Field(description="what keeps them apart; null if no two of their places look alike")
-    explanation: str = Field(description="the binding reason, with its numbers")
-
-
-class MapJoin(StrictModel):
-    """On what evidence two robots share a map; null where the maps were not compared."""
-
-    robots: tuple[str, str] = Field(description="sessions of both robots")
-    map: int = Field(description="number of their map")
-    closures: int = Field(description="number of closures between them that agree")
-    places: int = Field(description="number of separate places of these closures")
-    seen_m: float | None = Field(description="wall that both robots saw, metres")
-    contradicting_m: float | None = Field(description="wall of one robot in the free space of the other, metres")
-    likeness: float | None = Field(
-        description="how well the walls lie on each other, without a unit: about 1 in one place, 0 or less in places "
-        "that only look alike"
-    )
-    elsewhere: float | None = Field(
-        description="how well the maps fit at the best other transform, as a share, without a unit; 0: nowhere else"
-    )
-    explanation: str = Field(description="all of this in one line")
+    map: int = Field(description="number of the map")
+    robots: list[str]
+    use: Use = Field(description="`use` it, use it with a `reserve`, or `wait`: do not use it yet")
+    sentence: str = Field(description="the decision, its reason, and what to do next")
+    details: list[str] = Field(description="further concerns, and what the decision rests on")
+    where: list[Point] = Field(description="places to look at, or between which to drive")
 
 
 class DetectorSummary(StrictModel):
