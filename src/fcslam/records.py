@@ -281,6 +281,14 @@ class CloudScan:
     new_floor: str = ""
     """As in ``LaserScan``."""
 
+    @property
+    def T_odom_base(self) -> FloatArray:
+        """Pose by odometry at the stamp, shape (3,), between the readings around it; NaN without readings."""
+        if not len(self.wheels):
+            return frozen(np.full(3, np.nan))
+        stamps, x, y, heading = self.wheels.T
+        return frozen([np.interp(self.stamp, stamps, each) for each in (x, y, np.unwrap(heading))])
+
 
 SensorRecord = LaserScan | Odometry | CameraImage | GnssFix | CloudScan
 """A record of one of a robot's sensors."""

@@ -36,6 +36,7 @@ from fcslam.records import (
     CODE_BYTES,
     PLACE_CHANNELS,
     Channel,
+    CloudScan,
     Constraint,
     ConstraintKind,
     FloatArray,
@@ -105,6 +106,18 @@ def warm_up_tracking(config: RobotConfig) -> None:
     point_scan(scans[0].ranges_m, scans[0].laser)  # of a laser that states no beam times
     gc.collect()
     gc.freeze()
+
+
+def warm_up_space() -> None:
+    """Compile what a robot with a 3D LiDAR needs."""
+    from fcslam.robot.frontend3d import RobotFrontend3d  # robots with 2D LiDARs have no use for it
+
+    robot = RobotFrontend3d("r", RobotConfig())
+    for record in made_up_turns(_STEPS):
+        for packet in robot.process(record):
+            measure(packet)
+    for packet in robot.finish():
+        measure(packet)
 
 
 def warm_up_decoding() -> None:
@@ -198,3 +211,26 @@ def _ranges(pose: FloatArray, scale: float = 1.0) -> Ranges:
     gaps_m = scale * _ROOM[:, 2:] - _ROOM[:, :2] @ pose[:2, None]
     distances_m = np.divide(gaps_m, facing, out=np.full_like(facing, np.inf), where=facing > 0.0)
     return rounded(distances_m.min(axis=0), _LASER.max_range_m)
+
+
+def made_up_turns(count: int) -> Iterator[CloudScan]:
+    """Turns of a 3D LiDAR at 1 m height, with wheels and an IMU, that drives through the room, 0.3 m at a time."""
+    heights = np.linspace(0.0, 2.0, 9)
+    for k in range(count):
+        pose = np.array((3.0 + 0.3 * k, 4.0, 0.0))
+        ranges, angles = _ranges(pose), _LASER.angles_rad()
+        wall = np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles)))
+        walls = np.concatenate([np.column_stack((wall, np.full(len(wall), height))) for height in heights])
+        floor = np.concatenate([np.column_stack((share * wall, np.zeros(len(wall)))) for share in (0.2, 0.4, 0.6, 0.8)])
+        points = np.concatenate((walls, floor))
+        stamps = k + np.linspace(0.0, 1.0, 11)
+        wheels = np.column_stack((stamps, 3.0 + 0.3 * stamps, np.full((11, 2), (4.0, 0.0))))
+        imu = np.column_stack((stamps, np.zeros((11, 5)), np.full(11, 9.81)))
+        yield CloudScan(
+            float(k),
+            frozen(points, np.float32),
+            frozen(np.zeros(len(points)), np.float32),
+            frozen(np.array([0.0, 0.0, 1.0])),
+            frozen(wheels),
+            frozen(imu),
+        )

@@ -12,6 +12,7 @@ from fcslam.records import Constraint, FloatArray, Keyscan, LaserModel, Place, V
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Hello, Packet
 from tests.flats import BACK, ROUND, Drive, flat
+from tests.small_fleet import in_order
 
 SCANNER_M = 0.6
 HEIGHTS_M = np.arange(0.05, 2.05, 0.1)
@@ -88,3 +89,15 @@ def voxel_map(
     T_base_ground = frozen(se3.inverse(T_ground_base))
     made = frozen(steps, np.int16), frozen(to_steps(origins), np.int16), frozen(seen_from, np.uint8)
     return VoxelMap(place.id, place.first, place.last, T_base_ground, *made)
+
+
+GROUND = {"a": leaning(0.08), "b": leaning(-0.05)}
+
+
+def sent(*robots: str, extra: FloatArray | None = None) -> list[Packet]:
+    """Packets of robots: in capitals those with a 2D LiDAR."""
+    packets: list[Packet] = []
+    for name in robots:
+        plane = planar(name.lower(), ord(name.lower()))
+        packets += plane if name.isupper() else in_space(plane, GROUND[name], extra if name == "b" else None)
+    return in_order(packets)

@@ -16,23 +16,13 @@ from fcslam.mission.mission_file import read_mission
 from fcslam.records import ClosureStatus, ReasonCode, VoxelMap
 from fcslam.runs import open_run
 from fcslam.wire.packets import encode
-from tests.cloud.space_fleet import BASE_M, in_space, leaning, planar
+from tests.cloud.space_fleet import BASE_M, GROUND, sent
 from tests.flats import BACK, ROUND, Drive, flat
-from tests.small_fleet import feed, fingerprint, in_order, map_of
+from tests.small_fleet import feed, fingerprint, map_of
 
 pytestmark = pytest.mark.slow
 
 SPACE = FleetConfig(dimensions=3)
-GROUND = {"a": leaning(0.08), "b": leaning(-0.05)}
-
-
-def sent(*robots, extra=None):
-    """Packets of robots: in capitals those with a 2D LiDAR."""
-    packets = []
-    for name in robots:
-        plane = planar(name.lower(), ord(name.lower()))
-        packets += plane if name.isupper() else in_space(plane, GROUND[name], extra if name == "b" else None)
-    return in_order(packets)
 
 
 def result_of(packets, config=SPACE):

@@ -2,6 +2,7 @@
 
 import threading
 from contextlib import closing
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from fcslam.geometry import se2
 from fcslam.live.records import EventKind, LocalizationState, Wiring
 from fcslam.live.robot import Robot
 from fcslam.maps.occupancy_map import Occupancy
-from fcslam.records import Channel, Place
+from fcslam.mission.driving import front_end_of
+from fcslam.records import Channel, CloudScan, LaserScan, Place
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.outbox import Outbox
 from fcslam.wire.http_transport import Server
@@ -24,6 +26,8 @@ from tests.features.networks import tiny_network
 from tests.live.same_thread import SameThread
 from tests.robot.fake_cloud import FakeCloud, Network, content
 from tests.robot.kidnapping import kidnapping
+from tests.spinning_lidar import circle, room
+from tests.spinning_lidar import drive as drive_lidar
 from tests.wire.examples import CORRECTION
 
 pytestmark = pytest.mark.slow
@@ -38,15 +42,20 @@ def test_a_server_hides_its_token_and_has_a_budget_above_zero():
             Server("https://cloud", budget_kBps=budget_kBps)
 
 
-@pytest.fixture(scope="module")
-def scans():
+@pytest.fixture(scope="module", params=["2D"])
+def scans(request):
+    if request.param == "3D":
+        return [scan for scan, _ in drive_lidar(room(1), circle((6.0, 4.0), 1.6, 0.8), 80, azimuths=120)]
     return list(small_fleet.draw(1, path_length_m=12.0).robots[0].scans())
+
+
+both_lidars = pytest.mark.parametrize("scans", ["2D", "3D"], indirect=True)
 
 
 @pytest.fixture(scope="module")
 def alone(scans):
     """Results of the front end without any network."""
-    frontend = RobotFrontend("alice", RobotConfig())
+    frontend = front_end_of("alice", RobotConfig(), scans[:1])
     return [packet for scan in scans for packet in frontend.process(scan)] + frontend.finish()
 
 
@@ -62,15 +71,17 @@ class Clock:
 
 
 def drive(tmp_path, network, records, resume=False, watch=lambda _: None, recording="r"):
-    pause = threading.Event()
+    pause, records = threading.Event(), iter(records)
+    first = next(records)
+    in_space = isinstance(first, CloudScan)
     robot = Robot(
-        "alice", state=tmp_path, own_map=False,
+        "alice", state=tmp_path, own_map=False, lidar_3d=in_space, config={"fleet": {"dimensions": 2 + in_space}},
         wiring=Wiring(
             SameThread(), Clock(), lambda _: pause.wait(0.001), recording, resume, transport=network
         ),
     )  # fmt: skip
     with closing(robot):
-        play_records(robot, records, AS_FAST_AS_POSSIBLE, watch)
+        play_records(robot, chain([first], records), AS_FAST_AS_POSSIBLE, watch)
         return robot
 
 
@@ -85,6 +96,7 @@ def contents(packets):
     return [encode(packet) for packet in packets]
 
 
+@both_lidars
 def test_the_cloud_gets_what_the_front_end_says(scans, alone, tmp_path):
     cloud = FakeCloud(correction=CORRECTION.version)
     robot = drive(tmp_path, Network(cloud), scans)
@@ -95,11 +107,12 @@ def test_the_cloud_gets_what_the_front_end_says(scans, alone, tmp_path):
     assert (now.map_index, now.left_out, now.refused, now.is_catching_up) == (CORRECTION.map_index, 0, 0, False)
     assert now.sent_bytes == sum(map(len, cloud.stored.values()))
     path = robot.trajectory()
-    stamps, poses = path.stamps, path.T_map_base
-    assert np.array_equal(stamps, [scan.stamp for scan in scans])
-    assert np.allclose(se2.between(CORRECTION.T_map_odom, poses[0]), 0.0, atol=1e-9)
+    assert np.array_equal(path.stamps, [scan.stamp for scan in scans])
+    assert np.allclose(se2.between(CORRECTION.T_map_odom, path.T_map_base[0]), 0.0, atol=1e-9)
+    assert path.poses.shape == (len(scans), 3 if isinstance(scans[0], LaserScan) else 7)
 
 
+@both_lidars
 @pytest.mark.parametrize("stop", [1, 40])
 def test_a_robot_that_was_stopped_goes_on_in_the_same_epoch(scans, alone, tmp_path, stop):
     cloud = FakeCloud()

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from fcslam.cloud.replies import NEWS_M, NEWS_RAD, SessionCorrection
 from fcslam.errors import InputError, PacketConflictError, StoreError
+from fcslam.geometry import se3
 from fcslam.mission.mission_store import EDITS, FACTS, PACKETS, MissionStore, StoredPacket, check_mission
 from fcslam.records import Channel, Correction, Edit, Removal, Undo, Veto, frozen
 from fcslam.service.shared.mission_tables import MissionTables
@@ -148,6 +149,16 @@ def test_versions_of_corrections_grow_with_every_change_and_with_nothing_else(pl
     assert store.correction("a", 1) is None
     assert store.applied() == 5
     store.close()
+
+
+def test_a_correction_in_space_keeps_all_numbers_and_its_height_is_news(store):
+    pose = se3.exp((1.0, -2.0, 0.3, 0.01, -0.02, 1.5))
+    for height_m in (0.0, 0.0, 0.1):
+        moved = se3.compose(se3.exp((0.0, 0.0, height_m, 0.0, 0.0, 0.0)), pose)
+        store.progress(1, [correction("a", 1.0), SessionCorrection("b", 0, 1.0, Correction("b", 0, 0, frozen(moved)))])
+        assert store.correction("b", 0).correction.T_map_odom.tobytes() == moved.tobytes()
+    assert store.correction("b", 0).correction.version == 2
+    assert store.correction("a", 0).correction.T_map_odom.shape == (3,)
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "theta"])

@@ -8,16 +8,20 @@ import subprocess
 import sys
 import tempfile
 import time
-from functools import cache
+from functools import cache, reduce
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fcslam.cloud.host import FleetHost
+from fcslam.cloud.replies import NEWS_M
+from fcslam.cloud.settings import CloudConfig, FleetConfig
+from fcslam.geometry import se3
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.mission.mission_store import MissionStore, StoredPacket
-from fcslam.records import ClosureStatus, FloorLabel, Place, Removal, Undo, Veto
+from fcslam.records import ClosureStatus, Constraint, ConstraintKind, FloorLabel, Place, Removal, Undo, Veto
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
 from fcslam.service.joint_maps import read_joint_maps
@@ -27,6 +31,7 @@ from fcslam.service.worker import AT_ONCE, MOST_CRASHES, QUALITY_EVERY_S, SNAPSH
 from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, read_label
+from tests.cloud.space_fleet import sent as sent_in_space
 from tests.scripted import closures, motion, rectangle, stream
 from tests.service.inline import InlineTask
 from tests.small_fleet import in_order
@@ -171,6 +176,35 @@ def test_a_worker_goes_on_from_its_snapshot_with_the_same_result(cloud):
     run = cloud.finalize()
     assert applied == [(packet.robot, packet.sequence) for packet in packets[cut:]], "no packet twice"
     assert content(run) == whole
+
+
+def test_in_space_a_restart_changes_no_byte_and_corrections_are_of_the_level_map(tmp_path):
+    packets, config = sent_in_space("a", "b"), CloudConfig(fleet=FleetConfig(dimensions=3))
+    found = []
+    for name, cuts in (("whole", ()), ("restarted", (len(packets) // 3, 2 * len(packets) // 3))):
+        cloud = Cloud(tmp_path / name, config)
+        for first, last in pairwise((0, *cuts, len(packets))):
+            cloud.put(packets[first:last])
+            cloud.work()
+            cloud.now += SNAPSHOT_EVERY_S
+            cloud.work()
+            cloud.restart()
+        found.append(content(cloud.finalize()))
+        live, told = open_run(cloud.folder.live), [cloud.store.correction(robot, 0).correction for robot in "ab"]
+        for correction in told:
+            motions = [
+                packet.body.T_i_j
+                for packet in packets
+                if packet.robot == correction.robot
+                and isinstance(packet.body, Constraint)
+                and packet.body.kind is ConstraintKind.ODOMETRY
+            ]
+            newest = reduce(se3.compose, motions, correction.T_map_odom)
+            written = np.loadtxt(cloud.folder.live / "trajectories" / f"{correction.robot}.tum")[-1, 1:]
+            assert np.abs(se3.log(se3.between(written, newest))).max() < 2 * NEWS_M
+        assert {one.map_index for one in live.trajectories.values()} == {0}
+        cloud.store.close()
+    assert found[0] == found[1]
 
 
 def test_when_robots_were_heard_survives_a_restart_and_a_replay_is_not_hearing_them(cloud):

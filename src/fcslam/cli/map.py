@@ -17,6 +17,7 @@ from fcslam.cli.options import (
     Force,
     Quiet,
     Sensors,
+    Space,
     WorkersOption,
     mission_config,
     output_option,
@@ -90,14 +91,7 @@ def map_recordings(
             "forces nothing; `-c 'fleet.start_sigma=[M,RAD]'` says how exactly you know it. Can be repeated.",
         ),
     ] = None,
-    in_space: Annotated[
-        bool,
-        typer.Option(
-            "--3d",
-            help="Map 3D LiDARs with six degrees of freedom: trajectories with height, roll and pitch, and map.ply. "
-            "Robots with 2D LiDARs share the map.",
-        ),
-    ] = False,
+    in_space: Space = False,
     sensors: Sensors = None,
     force: Force = False,
     quiet: Quiet = False,
@@ -108,7 +102,6 @@ def map_recordings(
         from fcslam.anchoring.anchors import read_anchors
         from fcslam.api import in_3d, split_recordings
         from fcslam.cluster.verifying import verifying
-        from fcslam.config import changed
         from fcslam.mission.mission import MissionInputs, continued_config
         from fcslam.mission.mission_file import EMPTY, read_mission
         from fcslam.robot.calibrating import calibrated
@@ -118,9 +111,7 @@ def map_recordings(
         output = output or new_folder(RUNS)
         prepare_output(output, force)
         earlier = EMPTY if onto is None else read_mission(onto)
-        settings = with_starts(mission_config(config, continued_config(earlier)), start)
-        if in_space:
-            settings = changed(settings, {"fleet": {"dimensions": 3}}, "--3d")
+        settings = with_starts(mission_config(config, continued_config(earlier), in_space), start)
         anchors = read_anchors(plan, plan_scale, tags)
         options = in_3d(bag_options(sensors), settings)
         if not logs and onto is None:

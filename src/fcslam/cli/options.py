@@ -76,6 +76,14 @@ UseSimTime = Annotated[
     bool, typer.Option("--use-sim-time", help="Take the time from /clock, as with a simulator.", rich_help_panel=_ROS)
 ]
 
+Space = Annotated[
+    bool,
+    typer.Option(
+        "--3d",
+        help="Map 3D LiDARs with six degrees of freedom: poses with height, roll and pitch, and a 3D map. Robots with "
+        "2D LiDARs share the map.",
+    ),
+]
 Floor = Annotated[str, typer.Option(help="Floor of the building. Places of different floors are never compared.")]
 ServerUrl = Annotated[
     str | None,
@@ -162,15 +170,19 @@ def _single_key(text: str) -> "re.Match[str] | None":
     return None if os.path.exists(text) else _ONE_KEY.fullmatch(text)
 
 
-def mission_config(chosen: Sequence[str] | None, default: "MissionConfig | None" = None) -> "MissionConfig":
-    """The configuration of a mission that the command line chooses.
+def mission_config(
+    chosen: Sequence[str] | None, default: "MissionConfig | None" = None, in_space: bool = False
+) -> "MissionConfig":
+    """The configuration of a mission that the command line chooses; ``in_space`` as by --3d.
 
     Files and presets change the defaults. Without any, single keys change ``default``.
     """
+    from fcslam.config import changed
     from fcslam.mission.mission import MissionConfig
 
     base = default if default is not None and all(map(_single_key, chosen or ())) else MissionConfig()
-    return chosen_settings(base, chosen, {preset.value: preset.file for preset in Preset})
+    settings = chosen_settings(base, chosen, {preset.value: preset.file for preset in Preset})
+    return changed(settings, {"fleet": {"dimensions": 3}}, "--3d") if in_space else settings
 
 
 def with_starts(config: "MissionConfig", starts: Sequence[str] | None) -> "MissionConfig":

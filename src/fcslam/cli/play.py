@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from functools import partial
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,6 +21,7 @@ from fcslam.cli.options import (
     Quiet,
     Sensors,
     ServerUrl,
+    Space,
     access,
     mission_config,
 )
@@ -61,6 +63,7 @@ def play(
     ] = None,
     floor: Floor = "",
     config: ConfigFiles = None,
+    in_space: Space = False,
     sensors: Sensors = None,
     learn: Learn = False,
     quiet: Quiet = False,
@@ -70,36 +73,47 @@ def play(
     from fcslam.cloud.sessions import check_robot
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
+    from fcslam.records import CloudScan
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
 
     keep_private()
     if is_live(recording):
         raise InputError(f"{recording}: is a live robot; `fcslam robot {recording}` maps it")
-    settings, cloud = mission_config(config), access(server, credentials, budget_kBps)
+    settings, cloud = mission_config(config, in_space=in_space), access(server, credentials, budget_kBps)
     if cloud is None:
         raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")
     pace = PlaybackPace(speed, time.monotonic, time.sleep)
     console = notices(quiet)
-    opened, survey = open_recording(recording, sensors, console)
+    opened, survey = open_recording(recording, sensors, console, in_3d=settings.fleet.dimensions == 3)
     try:
         check_robot(opened.name)
     except PacketError as error:
         raise InputError(f"{error}; give another one: NAME=LOG") from error
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
     fingerprint = _fingerprint(opened.name, survey, settings.robot, cloud.budget_kBps, floor)
-    with copied_process(settings.robot) as worker:
+    records = opened.records()
+    first = list(islice(records, 1))
+    lidar_3d = any(isinstance(record, CloudScan) for record in first)
+    with copied_process(None if lidar_3d else settings.robot) as worker:
         wiring = Wiring(worker, recording=fingerprint, resumes=resume, keeps_keyframes=learn)
         robot = Robot(
-            opened.name, server=cloud, state=state, config=settings, own_map=False, floor=floor, wiring=wiring
+            opened.name,
+            server=cloud,
+            state=state,
+            config=settings,
+            own_map=False,
+            floor=floor,
+            lidar_3d=lidar_3d,
+            wiring=wiring,
         )
         with closing(robot):
             signal.signal(signal.SIGTERM, signal.default_int_handler)  # service managers send it
             try:
-                with compiled(console), ProgressDisplay(console) as display:
+                with compiled(console, lidar_3d), ProgressDisplay(console) as display:
                     watch = robot_watch(display, console, survey.scan_count)
                     stay = None if plan is None else partial(_learn, plan, console, display, watch)
-                    play_records(robot, opened.records(), pace, watch, stay)
+                    play_records(robot, chain(first, records), pace, watch, stay)
             except KeyboardInterrupt:
                 left = robot.status().waiting
                 print_line(
@@ -220,7 +234,7 @@ def _report(robot: "Robot", state: Path, server: str) -> None:
         typer.echo(f"{lost}; {_localization(now, now.times_lost)}")
     if now.map_index is not None:
         trajectory = robot.trajectory()
-        write_tum(state / "trajectory.tum", trajectory.stamps, trajectory.T_map_base)
+        write_tum(state / "trajectory.tum", trajectory.stamps, trajectory.poses)
         typer.echo(f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}")
 
 
@@ -256,10 +270,10 @@ def play_records(
 
     ``stay`` is called after the last record, before the recording ends.
     """
-    from fcslam.records import LaserScan
+    from fcslam.records import CloudScan, LaserScan
 
     for record in records:
-        if isinstance(record, LaserScan) and not robot.status().is_catching_up:
+        if isinstance(record, LaserScan | CloudScan) and not robot.status().is_catching_up:
             pace.wait(record.stamp)
         robot.add(record)
         robot.wait_for_room(watch)

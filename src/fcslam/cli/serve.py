@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fcslam.cli.listening import Credentials, check_tls, find_files, listen
-from fcslam.cli.options import ConfigFiles, Quiet, WorkersOption, mission_config
+from fcslam.cli.options import ConfigFiles, Quiet, Space, WorkersOption, mission_config
 from fcslam.cli.output import notices
 from fcslam.cli.warm_up import report_uncached
 
@@ -35,6 +35,7 @@ def serve(
         ),
     ] = None,
     config: ConfigFiles = None,
+    in_space: Space = False,
     learn: Annotated[
         bool,
         typer.Option(
@@ -84,7 +85,7 @@ def serve(
     logging.basicConfig(level=logging.WARNING if quiet else logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     with ExitStack() as stack, listen(host, port) as listening:
         known = read_tokens(tokens) if tokens is not None else None if client_ca is None else ()
-        authenticator, given = Authenticator(known), mission_config(config).cloud
+        authenticator, given = Authenticator(known), mission_config(config, in_space=in_space).cloud
         if store is None:
             state = serving.own_state(data, authenticator, given, workers)
         else:

@@ -56,11 +56,14 @@ def report_uncached(console: "Console") -> bool:
 
 
 @contextmanager
-def compiled(console: "Console") -> Iterator[None]:
-    """Wait until the code for the first scans is compiled and say why; the rest is compiled meanwhile."""
+def compiled(console: "Console", lidar_3d: bool = False) -> Iterator[None]:
+    """Wait until the code for the first scans is compiled and say why; the rest is compiled meanwhile.
+
+    A robot with a 3D LiDAR needs other code, which it compiles as it starts.
+    """
     from fcslam.warmup import compiling, is_cold
 
-    if report_uncached(console) or not is_cold():
+    if report_uncached(console) or lidar_3d or not is_cold():
         yield
         return
     processes = cores()
@@ -71,15 +74,17 @@ def compiled(console: "Console") -> Iterator[None]:
 
 
 @contextmanager
-def copied_process(config: "RobotConfig") -> "Iterator[Executor]":
+def copied_process(config: "RobotConfig | None") -> "Iterator[Executor]":
     """One worker, a copy of this process, until the end of this block; begin it before threads start.
+
+    ``config`` is that of a robot with a 2D LiDAR.
 
     Both share the memory of the tracker's code, unless that is not compiled yet: nobody waits for a compiler here.
     """
     from fcslam.robot.backend_runner import copied_worker
     from fcslam.warmup import is_cold, warm_up_tracking
 
-    if not is_cold():
+    if config is not None and not is_cold():
         warm_up_tracking(config)
     gc.freeze()
     with copied_worker() as worker:

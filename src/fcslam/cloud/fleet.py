@@ -282,8 +282,8 @@ class Fleet:
             pose_of = rigid.pose
             T_map_odom = self._graph.T_map_odom(session, rigid.T_map_base[session][-1])
         group = self._graph.group
-        T = T_placed_map(members, self._sessions, lambda keyscan: group.to_plane(pose_of(keyscan)), changes)
-        T_map_odom = frozen(T_map_odom if T is None else group.compose(group.from_plane(T), T_map_odom))
+        T = T_placed_map(members, self._sessions, pose_of, changes, group)
+        T_map_odom = frozen(T_map_odom if T is None else group.compose(T, T_map_odom))
         return Correction(session, self._decisions.version, indices[session], T_map_odom, quality)
 
     def _add_keyscan(self, keyscan: Keyscan, sequence: int) -> None:

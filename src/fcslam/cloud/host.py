@@ -13,6 +13,7 @@ from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
+from fcslam.geometry.groups import group_of
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.maps.fusion import fuse
 from fcslam.maps.occupancy_map import OccupancyMap
@@ -75,12 +76,14 @@ class FleetHost:
         return self.fleet.finalize(self.log, arrived, self._read)
 
     def poses(self, session: str) -> FloatArray:
-        """``T_map_base`` of the session's keyscans so far, shape (K, 3), metres and radians."""
-        mapped = (mapped.T_map_base for mapped in self.fleet.estimate().robots if mapped.robot == session)
-        return next(mapped, np.empty((0, 3)))
+        """``T_map_base`` of the session's keyscans so far, shape (K, P), metres and radians."""
+        found = (mapped for mapped in self.fleet.estimate().robots if mapped.robot == session)
+        paths = (mapped.T_map_base if mapped.space is None else mapped.space.T_map_base for mapped in found)
+        return next(paths, np.empty((0, self._settings.fleet.group.size)))
 
     def draw(self, session: str, T_other_map: FloatArray) -> OccupancyMap:
-        """The map that a session is in, in another frame."""
+        """The map that a session is in, in another frame, seen from above."""
+        T_other_map = group_of(T_other_map).to_plane(T_other_map)
         members = [
             replace(mapped, T_map_base=frozen(se2.compose(T_other_map, mapped.T_map_base)))
             for mapped in _in_map_of(session, self.fleet.estimate()).values()
@@ -90,6 +93,7 @@ class FleetHost:
 
     def closures(self, session: str, T_other_map: FloatArray) -> FloatArray:
         """Both ends of each accepted closure in the map of a session, shape (N, 2, 2), metres in another frame."""
+        T_other_map = group_of(T_other_map).to_plane(T_other_map)
         result = self.fleet.estimate()
         members = _in_map_of(session, result)
         ends = [

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.cloud.session_store import SessionStore
-from fcslam.geometry import se2
+from fcslam.geometry import se2, se3
+from fcslam.geometry.groups import SE2, SE3, Group
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, server_files
 from fcslam.records import Change, FloatArray, KeyscanId, MapRegion, Placement, RegionUse, frozen
 
 PoseOf = Callable[[KeyscanId], FloatArray]
-"""Pose of a keyscan in its map, shape (3,)."""
+"""Pose of a keyscan in its map, shape (P,)."""
 _FRACTION_BITS = 6
 """Fractional bits of the coordinates that OpenCV takes: polygons are exact to a 64th of a cell."""
 _MARGIN_CELLS = 1000
@@ -35,18 +36,32 @@ class PlacedRegion:
 
 
 def T_placed_map(
-    members: Sequence[str], sessions: SessionStore, pose_of: PoseOf, changes: Iterable[Change]
+    members: Sequence[str], sessions: SessionStore, pose_of: PoseOf, changes: Iterable[Change], group: Group
 ) -> FloatArray | None:
-    """The motion that puts a map where users want it, shape (3,); None if no placement names one of its sessions.
+    """The motion that levels a map in space and puts it where users want it, shape (P,); None if nothing moves it.
 
     ``pose_of`` gives poses in the map as it is; of several placements the last one counts.
     """
+    level = None if group is SE2 else _levelling(members, sessions, pose_of)
     placements = [change for change in changes if isinstance(change, Placement) and change.session in members]
     if not placements:
-        return None
+        return level
     last = placements[-1]
-    T_map_keyscan = pose_of(sessions.nearest(last.session, last.stamp))
-    return se2.compose(np.array(last.pose), se2.inverse(T_map_keyscan))
+    T_map_keyscan = group.to_plane(pose_of(sessions.nearest(last.session, last.stamp)))
+    T = group.from_plane(se2.compose(np.array(last.pose), se2.inverse(T_map_keyscan)))
+    return T if level is None else group.compose(T, level)
+
+
+def _levelling(members: Sequence[str], sessions: SessionStore, pose_of: PoseOf) -> FloatArray:
+    """The rotation about the origin that makes the floors of a map level in the mean; its first base may lean."""
+    seen = [voxels for session in members for voxels in sessions.voxel_maps(session)]
+    if not seen:
+        return SE3.identity
+    poses, grounds = np.array([pose_of(voxels.id) for voxels in seen]), np.array([each.T_base_ground for each in seen])
+    x, y, z = np.median(se3.rotation(SE3.compose(poses, grounds))[:, :, 2], axis=0)
+    lean_rad = float(np.arctan2(np.hypot(x, y), z))
+    axis = np.array([y, -x, 0.0]) / max(1e-12, float(np.hypot(x, y)))
+    return SE3.exp(np.concatenate((np.zeros(3), lean_rad * axis)))
 
 
 def placed_regions(

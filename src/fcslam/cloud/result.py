@@ -11,8 +11,7 @@ from fcslam.cloud.edits import is_cut
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.placement import PlacedRegion, T_placed_map, placed_regions
 from fcslam.cloud.session_store import SessionStore
-from fcslam.geometry import se3
-from fcslam.geometry.groups import SE2, SE3, Group
+from fcslam.geometry.groups import SE2, Group
 from fcslam.graph.evidence import ClusterEvidence
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import (
@@ -178,26 +177,10 @@ def _space_path(robot: str, sessions: SessionStore, fusion: Fusion, changes: Seq
     return SpacePath(fusion.T_map_base[robot], fusion.T_local_base[robot], kept)
 
 
-def _levelling(members: Sequence[str], sessions: SessionStore, fusion: Fusion) -> FloatArray:
-    """The rotation about the origin that makes the floors of a map level in the mean; its first base may lean."""
-    seen = [voxels for session in members for voxels in sessions.voxel_maps(session)]
-    floors = [SE3.compose(fusion.pose(voxels.id), voxels.T_base_ground) for voxels in seen]
-    if not floors:
-        return SE3.identity
-    x, y, z = np.median(se3.rotation(np.array(floors))[:, :, 2], axis=0)
-    lean_rad = float(np.arctan2(np.hypot(x, y), z))
-    axis = np.array([y, -x, 0.0]) / max(1e-12, float(np.hypot(x, y)))
-    return SE3.exp(np.concatenate((np.zeros(3), lean_rad * axis)))
-
-
 def _placed(fusion: Fusion, sessions: SessionStore, changes: Sequence[Change], group: Group) -> Fusion:
     T_map_base = dict(fusion.T_map_base)
     for members in fusion.maps:
-        T = T_placed_map(members, sessions, lambda keyscan: group.to_plane(fusion.pose(keyscan)), changes)
-        T = None if T is None else group.from_plane(T)
-        if group is not SE2:
-            level = _levelling(members, sessions, fusion)
-            T = level if T is None else group.compose(T, level)
+        T = T_placed_map(members, sessions, fusion.pose, changes, group)
         if T is not None:
             T_map_base |= {session: frozen(group.compose(T, T_map_base[session])) for session in members}
     return replace(fusion, T_map_base=T_map_base)

@@ -228,10 +228,11 @@ class SessionStore:
         return tuple(keyscan for keyscan in kept if keyscan is not None)
 
     def read_ahead(self, most: int) -> bool:
-        """Read up to ``most`` of the keyscans that ``restore`` named; False: all are read."""
+        """Read up to ``most`` of the keyscans that ``restore`` named, with their voxel maps; False: all are read."""
         chosen, self._unread = self._unread[-most:], self._unread[:-most]
-        for robot, number in chosen:
-            self._keyscan(robot, number)
+        for keyscan in chosen:
+            self._keyscan(*keyscan)
+            self.voxel_map(keyscan)
         return bool(chosen)
 
     def span(self, place: KeyscanId, channel: Channel) -> tuple[int, int]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2, se3
+from fcslam.records import frozen
 
 _Array = NDArray[np.float64]
 
@@ -116,3 +117,21 @@ SE3 = Group(
 def group_of(poses: _Array) -> Group:
     """The group of poses (..., P) by their size: (x, y, theta), or (x, y, z, qx, qy, qz, qw)."""
     return SE2 if poses.shape[-1] == SE2.size else SE3
+
+
+def compose(T_a_b: _Array, T_b_c: _Array) -> _Array:
+    """``T_a_c`` in the group of the poses, or in space if only one of them is in the plane."""
+    if T_a_b.shape[-1] == T_b_c.shape[-1]:
+        return group_of(T_a_b).compose(T_a_b, T_b_c)
+    return SE3.compose(to_space(T_a_b), to_space(T_b_c))
+
+
+def to_space(poses: _Array) -> _Array:
+    """Poses (..., P) as poses (..., 7) of SE(3)."""
+    return poses if poses.shape[-1] == SE3.size else SE3.from_plane(poses)
+
+
+def by_dimensions(poses: _Array) -> tuple[_Array, _Array | None]:
+    """Read-only poses (..., 3) in the plane, and those (..., 7) in space; None: they are in the plane."""
+    group, poses = group_of(poses), frozen(poses)
+    return (poses, None) if group is SE2 else (frozen(group.to_plane(poses)), poses)

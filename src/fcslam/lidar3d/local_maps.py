@@ -65,15 +65,15 @@ class Keyframes:
     def __init__(self) -> None:
         self.newest: MappedTurn | None = None
         self.vertical = Vertical()
-        self._covariance: FloatArray = np.zeros((6, 6))
+        self.covariance: FloatArray = np.zeros((6, 6))
         """Of the pose relative to the newest keyframe."""
 
     def add(self, tracked: Tracked, force: FloatArray | None) -> tuple[MappedTurn | None, KeyframeMotion | None]:
         """The turn as a keyframe, with the motion from the one before, or None; ``force`` is that of the IMU."""
         back = se3.adjoint(se3.inverse(tracked.motion))
-        predicted = back @ self._covariance @ back.T + np.diag(tracked.motion_sigma**2)
+        predicted = back @ self.covariance @ back.T + np.diag(tracked.motion_sigma**2)
         information = inverse(predicted) + tracked.measured
-        self._covariance = inverse(information)
+        self.covariance = inverse(information)
         if self.newest is None:
             return self._keyframe(tracked, 0, 0.0, force), None
         T = se3.between(self.newest.T_odom_base, tracked.T_odom_base)
@@ -84,10 +84,10 @@ class Keyframes:
             self.newest.number,
             self.newest.number + 1,
             T,
-            inverse(self._covariance + np.diag(_DRIFT**2)),
+            inverse(self.covariance + np.diag(_DRIFT**2)),
         )
         travel_m = self.newest.travel_m + float(np.linalg.norm(T[:3]))
-        self._covariance = np.zeros((6, 6))
+        self.covariance = np.zeros((6, 6))
         return self._keyframe(tracked, motion.j, travel_m, force), motion
 
     def _keyframe(self, tracked: Tracked, number: int, travel_m: float, force: FloatArray | None) -> MappedTurn:

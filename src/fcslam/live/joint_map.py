@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fcslam.compiled import njit
 from fcslam.geometry import se2
-from fcslam.lidar.frontend import ScanPose
+from fcslam.geometry.groups import group_of
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, draw_over
 from fcslam.lidar.scan import rays_of
 from fcslam.live.fleet_view import FleetView
@@ -86,10 +86,9 @@ class JointMap:
                 self._drawn.popleft()
             waiting = [(keyscan, laser) for its_session, keyscan, laser in self._drawn if its_session == session]
         lately = [
-            Casting(keyscan.ranges_m, laser, moved, keyscan.sweep)
+            Casting(keyscan.ranges_m, laser, group_of(moved).to_plane(moved), keyscan.sweep)
             for keyscan, laser in waiting
-            for T_odom_base in [track.in_odom(ScanPose(keyscan.stamp, keyscan.id.number, se2.IDENTITY))]
-            if (moved := localizer.T_map_base(T_odom_base)) is not None
+            if (moved := localizer.T_map_base(track.keyscan_in_odom(keyscan.id.number))) is not None
         ]
         return padded(draw_over(joint, lately, self._config))
 

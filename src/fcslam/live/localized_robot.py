@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +32,9 @@ from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.warmup import warm_up_tracking
 from fcslam.wire.messages import Body, Packet
 
+if TYPE_CHECKING:
+    from fcslam.robot.frontend3d import NewestTurn
+
 _NOWHERE = MapEstimate(frozen(np.full(3, np.nan)), frozen(np.full((3, 3), np.nan)), 0.0)
 """The estimate of a robot that is not localized."""
 
@@ -51,6 +54,7 @@ class LocalizedRobot(LiveTracker):
 
     fleet = None
     """The robot follows no fleet."""
+    _frontend: RobotFrontend
 
     def __init__(
         self,
@@ -124,7 +128,7 @@ class LocalizedRobot(LiveTracker):
 
     def status(self) -> RobotStatus:
         """Return the state of the robot: whether it knows its pose, and counts since its start."""
-        estimate, failure = self._estimate(), self._frontend.packets.failure
+        estimate, failure = self._estimate(), self._frontend.failure
         broken = f"not localized any more, as the search failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         return RobotStatus(
@@ -205,7 +209,9 @@ class LocalizedRobot(LiveTracker):
     def _take(self, packets: list[Packet]) -> None:
         """Nothing leaves a robot that makes no map."""
 
-    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray | None) -> RobotPose:
+    def _pose_of(
+        self, newest: "NewestScan | NewestTurn", T_smooth_base: FloatArray, T_odom_base: FloatArray | None
+    ) -> RobotPose:
         known = None if newest.is_deferred else self._estimate()
         self._drive.add(newest.pose.stamp, self._frontend.travel_m, T_smooth_base, known)
         estimate = known or _NOWHERE
@@ -216,9 +222,7 @@ class LocalizedRobot(LiveTracker):
             estimate.quality,
             known is not None,
             0,
-            newest.pose.T_keyscan_base,
-            newest.tracked,
-            self._frontend.motion.model,
+            self._frontend.belief,
             estimate.covariance,
         )
 
@@ -229,8 +233,8 @@ class LocalizedRobot(LiveTracker):
             self._event(EventKind.LOCALIZED, f"localized, quality {estimate.quality:.2f}")
         elif estimate is None and was_localized:
             self._event(EventKind.LOST, "not localized any more: the walls are others than in the map")
-        if self._frontend.packets.failure:
-            self._tell_failure(f"not localized from now on, as the search failed: {self._frontend.packets.failure}")
+        if self._frontend.failure:
+            self._tell_failure(f"not localized from now on, as the search failed: {self._frontend.failure}")
 
 
 def _localizer(occupancy: OccupancyMap, initial: FloatArray | None) -> MapLocalizer:

@@ -4,9 +4,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
-
-from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2, compose, group_of
 from fcslam.records import Correction, FloatArray, frozen
 
 
@@ -26,7 +24,7 @@ class CorrectedOdometry:
             self._arrived_s, self.correction = self._clock(), correction  # others read without a lock
 
     def move(self, T_map_odom: FloatArray) -> None:
-        """Move ``odom`` in the map of the newest correction, as shape (3,)."""
+        """Move ``odom`` in the map of the newest correction, as shape (P,)."""
         if self.correction is not None:
             self.correction = replace(self.correction, T_map_odom=frozen(T_map_odom))
 
@@ -46,8 +44,8 @@ class CorrectedOdometry:
         return None if self.correction is None else self._clock() - self._arrived_s
 
     def T_map_base(self, T_odom_base: FloatArray) -> FloatArray | None:
-        """Poses of ``base`` in the map, given those in ``odom``, shape (..., 3), metres and radians."""
-        return None if self.correction is None else se2.compose(self.correction.T_map_odom, T_odom_base)
+        """Poses of ``base`` in the map, given those in ``odom``, shape (..., P); in space if the map is."""
+        return None if self.correction is None else compose(self.correction.T_map_odom, T_odom_base)
 
 
 class MapPoses:
@@ -66,8 +64,8 @@ class MapPoses:
         return self._by_server.get(session) or self._own.setdefault(session, CorrectedOdometry(self._clock))
 
     def T_map_own(self, session: int) -> FloatArray:
-        """Where the robot's own map lies in the map of its poses, shape (3,)."""
-        return self._T_map_own.get(session, np.zeros(3))
+        """Where the robot's own map lies in the map of its poses, shape (P,)."""
+        return self._T_map_own.get(session, SE2.identity)
 
     def correct(self, session: int, correction: Correction, is_server_away: bool) -> None:
         """Take a correction of the robot's own map. While the server is away, it counts for the pose."""
@@ -75,7 +73,7 @@ class MapPoses:
             own = self._own.setdefault(session, CorrectedOdometry(self._clock))
             own.correct(correction)
             if session in self._T_map_own and own.correction is not None and is_server_away:
-                T_map_odom = se2.compose(self._T_map_own[session], own.correction.T_map_odom)
+                T_map_odom = compose(self._T_map_own[session], own.correction.T_map_odom)
                 self._by_server[session].move(T_map_odom)
 
     def correct_by_server(self, session: int, correction: Correction) -> None:
@@ -85,5 +83,5 @@ class MapPoses:
             by_server.correct(correction)
             if by_server.correction is correction:
                 own = self._own.get(session)
-                T_own_odom = np.zeros(3) if own is None or own.correction is None else own.correction.T_map_odom
-                self._T_map_own[session] = se2.compose(correction.T_map_odom, se2.inverse(T_own_odom))
+                T_own_odom = SE2.identity if own is None or own.correction is None else own.correction.T_map_odom
+                self._T_map_own[session] = compose(correction.T_map_odom, group_of(T_own_odom).inverse(T_own_odom))

@@ -11,13 +11,16 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.lidar.frontend import motion_information
-from fcslam.lidar.odometry import OdometryModel
-from fcslam.lidar.tracker import SEARCH_SIGMA_M, TrackedScan, weakest_sigma_m
+from fcslam.geometry.groups import SE2, SE3, compose
+from fcslam.lidar.tracker import SEARCH_SIGMA_M, weakest_sigma_m
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.backend_runner import worker_process
 from fcslam.robot.outbox import WaitingPackets
+from fcslam.robot.track import ScanBelief
 from fcslam.wire.http_transport import HttpTransport
+
+_PLANAR: Final = np.ix_((0, 1, 5), (0, 1, 5))
+"""x, y and heading of a covariance in space."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,12 +45,11 @@ class RobotPose:
     map_index: int | None
     """Identifies the map; robots with the same index share it. It may change when maps join. None: the robot is in
     a map of its own that has no index yet."""
-    _motion: FloatArray
-    """Since the last keyscan, shape (3,)."""
-    _tracked: TrackedScan
-    _odometry: OdometryModel
+    _belief: ScanBelief
     _before: FloatArray
     """Covariance of the keyscan before in the map, shape (3, 3); 0 in a map of the robot's own, which begins there."""
+    T_map_base_6d: FloatArray | None = None
+    """The pose with six degrees of freedom, (x, y, z, qx, qy, qz, qw), shape (7,); None in a map in 2D."""
 
     @property
     def x(self) -> float:
@@ -71,7 +73,8 @@ class RobotPose:
         Where it does not, as in a bare corridor, the odometry gives the motion along it; without odometry nothing does.
         A robot that stands still keeps its pose: True.
         """
-        return self._tracked.scan is None or weakest_sigma_m(self._tracked.information) <= SEARCH_SIGMA_M
+        points = self._belief.points
+        return points is None or weakest_sigma_m(points) <= SEARCH_SIGMA_M
 
     @property
     def covariance(self) -> FloatArray:
@@ -80,9 +83,25 @@ class RobotPose:
         It is that of the match with the surfaces that the robot saw last; in a finished map, that of the match with the
         map is added. The error of the map is not part of it. NaN where ``T_map_base`` is.
         """
-        information = motion_information(self._motion, self._tracked, self._odometry)
-        turn = se2.adjoint((0.0, 0.0, self.T_map_base[2]))
-        return frozen(self._before + turn @ np.linalg.inv(information) @ turn.T)
+        covariance = self._covariance
+        return frozen(self._before + (covariance if len(covariance) == SE2.freedom else covariance[_PLANAR]))
+
+    @property
+    def covariance_6d(self) -> FloatArray:
+        """The same over (x, y, z) and the rotations about the axes of ``map``, shape (6, 6); 0 where a robot with a 2D
+        LiDAR measures nothing."""
+        covariance, planar = self._covariance, np.zeros((SE3.freedom, SE3.freedom))
+        planar[_PLANAR] = self.covariance
+        return frozen(planar if len(covariance) == SE2.freedom else covariance)
+
+    @property
+    def _covariance(self) -> FloatArray:
+        covariance = self._belief.covariance()
+        group = SE2 if len(covariance) == SE2.freedom else SE3
+        turned = np.array(self.T_map_base if group is SE2 else self.T_map_base_6d)
+        turned[: group.axes] = 0.0
+        turn = group.adjoint(turned)
+        return turn @ covariance @ turn.T
 
     @property
     def T_map_odom(self) -> FloatArray | None:
@@ -91,6 +110,18 @@ class RobotPose:
         if self.T_odom_base is None or np.isnan(self.T_map_base[0]):
             return None
         return frozen(se2.compose(self.T_map_base, se2.inverse(self.T_odom_base)))
+
+    @property
+    def T_map_odom_6d(self) -> FloatArray | None:
+        """The same with six degrees of freedom, shape (7,); None in a map in 2D, too."""
+        if self.T_odom_base is None or self.T_map_base_6d is None:
+            return None
+        return frozen(compose(self.T_map_base_6d, se2.inverse(self.T_odom_base)))
+
+    @property
+    def z(self) -> float:
+        """Metres; 0 in a map in 2D."""
+        return 0.0 if self.T_map_base_6d is None else float(self.T_map_base_6d[2])
 
 
 class LocalizationState(StrEnum):

@@ -12,7 +12,7 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from fcslam.api import settings_of
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import InputError, PacketError
-from fcslam.geometry import se2
+from fcslam.geometry.groups import SE2, by_dimensions, compose, group_of, to_space
 from fcslam.lidar.frontend import ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_RAD
 from fcslam.live.fleet_view import FleetView
 from fcslam.live.inputs import Lasers, checked_camera, checked_image, checked_stamp
@@ -50,12 +50,15 @@ from fcslam.robot.outbox import Outbox
 from fcslam.robot.sender import CONNECTING, SEND_INTERVAL_S
 from fcslam.robot.uplink import Uplink
 from fcslam.runs import RobotTrajectory, Run, prepare_output
-from fcslam.warmup import warm_up_tracking
+from fcslam.warmup import warm_up_space, warm_up_tracking
 from fcslam.wire.checks import check_floor
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.http_transport import HttpTransport, Server
 from fcslam.wire.keys import Credentials
 from fcslam.wire.messages import Packet
+
+if TYPE_CHECKING:
+    from fcslam.robot.frontend3d import NewestTurn
 
 EVENT_M, EVENT_RAD = ODOMETRY_SIGMA_M, ODOMETRY_SIGMA_RAD
 """Corrections that move the robot by less are not events."""
@@ -98,6 +101,7 @@ class Robot(LiveTracker):
         config: MissionConfig | Mapping[str, Any] | StrPath | None = None,
         own_map: bool = True,
         floor: str = "",
+        lidar_3d: bool = False,
         on_event: Callable[[RobotEvent], None] | None = None,
         wiring: Wiring = WIRED,
     ) -> None:
@@ -114,6 +118,8 @@ class Robot(LiveTracker):
             own_map: whether the robot has a map of its own; a robot with a server may do without.
             floor: floor of the building, 1 to 16 letters, digits and ``. _ + -``. Places of different floors are never
                 compared. Empty: none is named.
+            lidar_3d: whether the robot has a 3D LiDAR. ``add`` then takes ``CloudScan`` records, and poses have six
+                degrees of freedom. The configuration needs ``fleet.dimensions`` 3.
             on_event: called by ``add_scan``, ``add_image`` and ``add``, in their thread, before they return.
             wiring: for fcslam's own commands and tests.
 
@@ -123,6 +129,8 @@ class Robot(LiveTracker):
         """
         _check_floor(floor)
         super().__init__(name, laser, settings_of(config), on_event)
+        if lidar_3d and self._config.fleet.group is SE2:
+            raise InputError(f"{self.name}: a 3D LiDAR needs a map in space; set fleet.dimensions to 3 (--3d)")
         self._camera = checked_camera(camera)
         self._clock = wiring.clock
         self._newest_session = 0
@@ -152,11 +160,14 @@ class Robot(LiveTracker):
             if sends and folder is not None:
                 outbox = stack.enter_context(closing(Outbox(folder / "outbox.sqlite", self.name, LARGEST_OUTBOX_BYTES)))
             keyframes = _keyframe_folder(folder, wiring.resumes) if wiring.keeps_keyframes else None
-            self._start(executor, own_map, keyframes)
+            self._start(executor, own_map, keyframes, lidar_3d)
             self._frontend.change_floor(floor)
             if outbox is not None and folder is not None:
                 self._uplink = self._connect(access, outbox, folder, wiring, own_map, stack)
-            warm_up_tracking(self._config.robot)
+            if lidar_3d:
+                warm_up_space()
+            else:
+                warm_up_tracking(self._config.robot)
             self._stack = stack.pop_all()
 
     def add_image(self, image: ArrayLike, stamp: float, odometry: ArrayLike | None = None) -> None:
@@ -187,7 +198,7 @@ class Robot(LiveTracker):
     def status(self) -> RobotStatus:
         """Return the state of the robot: its place in the map, its connection, and counts since its start."""
         uplink, localizer, tracks = self._uplink, self._map_poses.localizer(self._session), self._frontend.tracks
-        failure = self._frontend.packets.failure
+        failure = self._frontend.failure
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         status = RobotStatus(
@@ -263,23 +274,27 @@ class Robot(LiveTracker):
             track = self._frontend.tracks[session]
             stamps, keyscans, offsets = track.stamps, track.keyscans, track.T_keyscan_base
             T_odom_keyscan = track.T_odom_keyscan
-        known = np.empty((0, 3)) if self._own is None else self._own.poses(session_name(self.name, session))
+        known = T_odom_keyscan[:0] if self._own is None else self._own.poses(session_name(self.name, session))
         # The map may have got keyscans since the track was read.
-        known = se2.compose(self._map_poses.T_map_own(session), known[: len(T_odom_keyscan)])
+        known = compose(self._map_poses.T_map_own(session), known[: len(T_odom_keyscan)])
         # Keyscans that the map does not have yet go on from the last one that it has.
-        moved = self._map_poses.localizer(session).T_map_base(np.zeros(3))
-        T_map_odom = np.zeros(3) if moved is None else moved
+        group = group_of(T_odom_keyscan)
+        moved = self._map_poses.localizer(session).T_map_base(group.identity)
+        T_map_odom = group.identity if moved is None else moved
         if len(known):
-            T_map_odom = se2.compose(known[-1], se2.inverse(T_odom_keyscan[len(known) - 1]))
-        poses = np.concatenate((known, se2.compose(T_map_odom, T_odom_keyscan[len(known) :])))
+            T_map_odom = compose(known[-1], group.inverse(T_odom_keyscan[len(known) - 1]))
+        rest = compose(T_map_odom, T_odom_keyscan[len(known) :])
+        poses = np.concatenate((known, rest)) if len(known) else rest
         index = self._map_poses.localizer(session).map_index
-        T_map_base = se2.compose(poses[keyscans], offsets)
+        T_map_base = compose(poses[keyscans], offsets)
+        planar, in_space = by_dimensions(T_map_base)
         return RobotTrajectory(
             session_name(self.name, session),
             0 if index is None else index,
             frozen(stamps),
-            frozen(T_map_base),
+            planar,
             track.floor,
+            in_space,
         )
 
     def finish(self, timeout_s: float | None = None, watch: Callable[[RobotStatus], None] | None = None) -> bool:
@@ -358,10 +373,15 @@ class Robot(LiveTracker):
         run.save(folder, force)
         return run
 
-    def _start(self, executor: Executor, own_map: bool, keyframes: Path | None) -> None:
+    def _start(self, executor: Executor, own_map: bool, keyframes: Path | None, lidar_3d: bool) -> None:
         robot = self._config.robot
         try:
             self._own = OwnMap(self.name, self._config, executor, self._correct) if own_map else None
+            if lidar_3d:
+                from fcslam.robot.frontend3d import RobotFrontend3d  # robots with 2D LiDARs have no use for it
+
+                self._frontend = RobotFrontend3d(self.name, robot)
+                return
             backend = in_worker(self.name, robot, executor, keyframes)
             self._frontend = RobotFrontend(self.name, robot, backend, self._mark_teammates)
         except BrokenExecutor as error:
@@ -405,7 +425,7 @@ class Robot(LiveTracker):
         uplink, own = self._uplink, self._own
         unstored, is_full = (0, False) if uplink is None else (uplink.unstored, uplink.outbox.is_full)
         with self._lock:
-            behind = max(self._frontend.packets.backlog, unstored, 0 if own is None else own.backlog) > LARGEST_BACKLOG
+            behind = max(self._frontend.backlog, unstored, 0 if own is None else own.backlog) > LARGEST_BACKLOG
             if behind:
                 self._take(self._frontend.ready())
         return behind or is_full
@@ -423,7 +443,7 @@ class Robot(LiveTracker):
     def _catch_up(self) -> None:
         """Wait, without keeping scans waiting, until the back end has handled everything so far."""
         with self._lock:
-            output = self._frontend.packets.newest
+            output = self._frontend.awaited
         if output is not None:
             wait([output])
         with self._lock:
@@ -457,21 +477,23 @@ class Robot(LiveTracker):
         is_server_away = self._uplink is None or self._uplink.sender.trouble is not None
         self._map_poses.correct(session, correction, is_server_away)
 
-    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray | None) -> RobotPose:
+    def _pose_of(
+        self, newest: "NewestScan | NewestTurn", T_smooth_base: FloatArray, T_odom_base: FloatArray | None
+    ) -> RobotPose:
         localizer = self._map_poses.localizer(self._session)
         corrected = localizer.T_map_base(T_smooth_base)
         is_found = self._frontend.scan_poses.is_new_floor or localizer.quality > 0.0
+        planar, in_space = by_dimensions(T_smooth_base if corrected is None else corrected)
         return RobotPose(
             newest.pose.stamp,
-            frozen(T_smooth_base if corrected is None else corrected),
+            planar,
             T_odom_base,
             newest.quality,
             is_found and not newest.is_deferred,
             localizer.map_index,
-            newest.pose.T_keyscan_base,
-            newest.tracked,
-            self._frontend.motion.model,
+            self._frontend.belief,
             np.zeros((3, 3)),
+            in_space,
         )
 
     def _tell(self) -> None:
@@ -497,7 +519,7 @@ class Robot(LiveTracker):
                 self._event(EventKind.FLEET, line)
         if self._own is not None:
             self._own.hand_over(self._newest_s - SEND_INTERVAL_S)
-        broken = self._frontend.packets.failure, None if self._own is None else self._own.failure
+        broken = self._frontend.failure, None if self._own is None else self._own.failure
         for failure in filter(None, broken):
             self._tell_failure(f"no loop closures from now on, as the back end failed: {failure}")
 
@@ -521,9 +543,12 @@ class Robot(LiveTracker):
         elif (before is None and self._uplink is not None) or (before and now.map_index != before.map_index):
             self._event(EventKind.JOINED, f"now in map {now.map_index}")
         T_smooth_base = self._frontend.scan_poses.in_odom(self._newest().pose)
-        T_map_before = np.zeros(3) if before is None else before.T_map_odom
-        moved = se2.between(se2.compose(T_map_before, T_smooth_base), se2.compose(now.T_map_odom, T_smooth_base))
-        distance_m, turned_rad = float(np.hypot(moved[0], moved[1])), abs(float(moved[2]))
+        T_map_before = SE2.identity if before is None else before.T_map_odom
+        after = compose(now.T_map_odom, T_smooth_base)
+        group = group_of(after)
+        earlier = compose(T_map_before, T_smooth_base)
+        moved = group.between(earlier if group is SE2 else to_space(earlier), after)
+        distance_m, turned_rad = float(group.shift_m(moved)), float(group.turn_rad(moved))
         if distance_m > EVENT_M or turned_rad > EVENT_RAD:
             self._event(EventKind.CORRECTED, f"corrected by {distance_m:.3f} m and {turned_rad:.4f} rad")
 

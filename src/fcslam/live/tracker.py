@@ -8,7 +8,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from contextlib import ExitStack, suppress
-from typing import Self
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,15 +19,23 @@ from fcslam.lidar.leaning import wrong_laser
 from fcslam.live.inputs import Lasers, checked_lasers, checked_robot, checked_scan, checked_stamp
 from fcslam.live.records import EventKind, RobotEvent, RobotPose
 from fcslam.mission.mission import MissionConfig
-from fcslam.records import FloatArray, LaserScan, SensorRecord, checked_pose, frozen
+from fcslam.records import CloudScan, FloatArray, LaserScan, SensorRecord, checked_pose, frozen
 from fcslam.robot.frontend import NewestScan, RobotFrontend
 from fcslam.sources.returns import FloorLine
 from fcslam.wire.messages import Packet
+
+if TYPE_CHECKING:
+    from fcslam.robot.frontend3d import NewestTurn, RobotFrontend3d
 
 UNDETERMINED_S = 1.0
 """The robot reports scans without odometry that leave a direction open for longer."""
 WARNINGS = EventKind.LOST, EventKind.FLOOR, EventKind.UNDETERMINED, EventKind.OFFLINE, EventKind.FAILED
 """Events that are logged as warnings; the others are information."""
+
+_OTHER_LIDAR: Final[dict[type, str]] = {
+    CloudScan: "this is a turn of a 3D LiDAR; make the robot with lidar_3d=True",
+    LaserScan: "this is a scan of a 2D LiDAR; make the robot without lidar_3d",
+}
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +43,7 @@ _log = logging.getLogger(__name__)
 class LiveTracker(ABC):
     """Tracks the scans of one robot in the thread that adds them; a subclass knows where they are in a map."""
 
-    _frontend: RobotFrontend
+    _frontend: "RobotFrontend | RobotFrontend3d"
     _executor: Executor
     """The worker beside the tracker: for what no pose must wait for."""
     _stack: ExitStack
@@ -65,8 +73,10 @@ class LiveTracker(ABC):
         """Pass the next packets of the front end on."""
 
     @abstractmethod
-    def _pose_of(self, newest: NewestScan, T_smooth_base: FloatArray, T_odom_base: FloatArray | None) -> RobotPose:
-        """The pose of the newest scan, given that in the tracker's frame and by odometry, each of shape (3,)."""
+    def _pose_of(
+        self, newest: "NewestScan | NewestTurn", T_smooth_base: FloatArray, T_odom_base: FloatArray | None
+    ) -> RobotPose:
+        """The pose of the newest scan, given that in the tracker's frame, shape (P,), and by odometry, shape (3,)."""
 
     @abstractmethod
     def _tell(self) -> None:
@@ -113,7 +123,9 @@ class LiveTracker(ABC):
         The caller vouches for the record: unlike ``add_scan``, this checks nothing.
         """
         with self._lock:
-            if isinstance(record, LaserScan):
+            if isinstance(record, LaserScan | CloudScan):
+                if not isinstance(record, self._frontend.scans):
+                    raise InputError(f"{self.name}: {_OTHER_LIDAR[type(record)]}")
                 return self._process(record)
             self._take(self._processed(record))
             return None
@@ -126,7 +138,7 @@ class LiveTracker(ABC):
     @property
     def odometry_jumps(self) -> int:
         """Number of jumps of the odometry so far."""
-        return self._frontend.odometry.jumps
+        return self._frontend.jumps
 
     def close(self) -> None:
         """End the worker and the connection at once. Packets that the server does not have wait in the state folder.
@@ -152,7 +164,7 @@ class LiveTracker(ABC):
             )
         return frozen(np.full(3, np.nan)) if given is None else checked_pose("odometry", given)
 
-    def _process(self, scan: LaserScan) -> RobotPose:
+    def _process(self, scan: LaserScan | CloudScan) -> RobotPose:
         """Localize a scan, and tell what happened. One that repeats the scan before has the pose of that one."""
         before = self._frontend.newest
         self._take(self._processed(scan))
@@ -164,11 +176,11 @@ class LiveTracker(ABC):
         T_smooth_base = self._frontend.scan_poses.in_odom(newest.pose)
         T_odom_base = None if np.isnan(scan.T_odom_base).any() else scan.T_odom_base
         pose = self._pose = self._pose_of(newest, T_smooth_base, T_odom_base)
-        if self._frontend.motion is not self._frontend.odometry:
+        if self._frontend.lacks_odometry:
             self._tell_undetermined(pose)
-        if (fault := self._frontend.odometry.check.fault) is not None:
+        if (fault := self._frontend.odometry_fault) is not None:
             self._tell_failure(f"the odometry {fault}; scan matching alone gives the motion")
-        if watched := watch_facing(self._facing[scan.laser.T_base_laser], scan):
+        if isinstance(scan, LaserScan) and (watched := watch_facing(self._facing[scan.laser.T_base_laser], scan)):
             with suppress(RuntimeError):  # a worker that has ended is told by what needs it
                 self._examined.append(self._executor.submit(wrong_laser, watched))
         self._tell_examined()
@@ -206,7 +218,7 @@ class LiveTracker(ABC):
         if self._on_event is not None:
             self._on_event(RobotEvent(kind, self._newest_s, text))
 
-    def _newest(self) -> NewestScan:
+    def _newest(self) -> "NewestScan | NewestTurn":
         newest = self._frontend.newest
         assert newest is not None  # there is one after a scan
         return newest

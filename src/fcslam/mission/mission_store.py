@@ -20,8 +20,20 @@ from fcslam.cloud.sessions import robot_and_epoch, robot_of, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.config import one_line
 from fcslam.errors import InputError, PacketConflictError, StoreError
-from fcslam.geometry.groups import SE2, SE3
-from fcslam.records import Change, Channel, Constraint, Correction, Edit, Keyscan, ManualClosure, Removal, Undo, frozen
+from fcslam.geometry.groups import SE2, SE3, group_of
+from fcslam.records import (
+    Change,
+    Channel,
+    Constraint,
+    Correction,
+    Edit,
+    FloatArray,
+    Keyscan,
+    ManualClosure,
+    Removal,
+    Undo,
+    frozen,
+)
 from fcslam.storage.database import Database, check_file, translate_errors
 from fcslam.storage.row_store import RowStore, StoreTable, Transaction, change_rows
 from fcslam.untrusted import check_unpacked, open_database, unpack
@@ -37,6 +49,8 @@ APPLIED = "applied"
 """A fact: how many packets took effect."""
 WAITING = "waiting"
 """A fact: how many packets of each robot waited for their effect when ``APPLIED`` was noted."""
+IN_SPACE = "T_map_odom "
+"""Facts of missions in space begin so, before robot and epoch: all numbers of the pose of a correction."""
 CONFIG = "config"
 """A fact: the mission's configuration."""
 VERSION = 8
@@ -458,6 +472,8 @@ def check_mission(path: Path) -> None:
                 Label("", PacketKind(kind), None if channel is None else Channel(channel))
         CloudConfig.model_validate_json(facts.get(CONFIG, "{}"))
         _backlog(facts)
+        if not all(len(_numbers(value)) == SE3.size for name, value in facts.items() if name.startswith(IN_SPACE)):
+            raise InputError("a correction in space is not a pose")
     except (ValueError, InputError) as error:
         raise StoreError(f"{path}: {one_line(str(error))}") from error
 
@@ -568,17 +584,28 @@ def _packet(
 def _read_correction(
     query: Callable[[str, tuple[str, int]], Iterable[Any]], robot: str, epoch: int
 ) -> SessionCorrection | None:
-    columns = "time, version, map_index, quality, x, y, theta"
-    statement = f"SELECT {columns} FROM corrections WHERE robot = ? AND epoch = ?"
-    for time, version, map_index, quality, *pose in query(statement, (robot, epoch)):
-        return SessionCorrection(robot, epoch, time, Correction(robot, version, map_index, frozen(pose), quality))
+    columns = "time, version, map_index, quality, value, x, y, theta"
+    statement = (
+        f"SELECT {columns} FROM corrections LEFT JOIN facts ON name = '{IN_SPACE}' || robot || ' ' || epoch"
+        " WHERE robot = ? AND epoch = ?"
+    )
+    for time, version, map_index, quality, in_space, *planar in query(statement, (robot, epoch)):
+        pose: FloatArray = frozen(planar if in_space is None else _numbers(in_space))
+        return SessionCorrection(robot, epoch, time, Correction(robot, version, map_index, pose, quality))
     return None
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(number) for number in text.split()]
 
 
 def _write_correction(database: Transaction, news: SessionCorrection) -> None:
     """Replace the session's correction; its version is the mission's next one."""
     correction = news.correction
     (version,) = database.execute("SELECT coalesce(max(version) + 1, 0) FROM corrections").fetchone()
-    pose, quality = correction.T_map_odom.tolist(), float(correction.quality)
-    row = (news.robot, news.epoch, version, float(news.time), correction.map_index, *pose, quality)
+    pose, quality = correction.T_map_odom, float(correction.quality)
+    if group_of(pose) is SE3:
+        _remember(database, f"{IN_SPACE}{news.robot} {news.epoch}", " ".join(map(repr, pose.tolist())))
+    planar = group_of(pose).to_plane(pose).tolist()
+    row = (news.robot, news.epoch, version, float(news.time), correction.map_index, *planar, quality)
     database.insert(CORRECTIONS, [row], replaces=True)

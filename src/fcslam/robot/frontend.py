@@ -13,6 +13,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,17 +21,18 @@ import numpy as np
 from pydantic import Field
 
 from fcslam.geometry import se2
-from fcslam.lidar.frontend import ScanPose
+from fcslam.lidar.frontend import ScanPose, motion_information
 from fcslam.lidar.lost import LostConfig, has_moved_unseen
+from fcslam.lidar.odometry import OdometryModel
 from fcslam.lidar.tracker import TrackedScan, TrackingResult
-from fcslam.records import CameraImage, DetectorFile, GnssFix, LaserScan, SensorRecord
+from fcslam.records import CameraImage, DetectorFile, FloatArray, GnssFix, LaserScan, SensorRecord
 from fcslam.robot.backend import BackendInput, NewDetector, RobotBackend, SessionConfig, Task
 from fcslam.robot.backend_runner import Submit, inline
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.packet_queue import PacketQueue
 from fcslam.robot.predicted_motion import PredictedMotion
 from fcslam.robot.session import DeferredScans, Motion, Outcome, Session
-from fcslam.robot.track import ScanTrack
+from fcslam.robot.track import ScanBelief, ScanTrack
 from fcslam.robot.wheel_odometry import WheelOdometry
 from fcslam.sources.contradictions import RepeatedScans
 from fcslam.sources.gate import is_clock_step
@@ -62,6 +64,9 @@ class RobotFrontend:
 
     The epoch of a packet is the number of its session, from 0.
     """
+
+    scans = LaserScan
+    """Records that have a pose."""
 
     def __init__(
         self,
@@ -106,6 +111,24 @@ class RobotFrontend:
         return self._session.motion
 
     @property
+    def belief(self) -> ScanBelief:
+        """Of the newest scan."""
+        assert self.newest is not None
+        pose, tracked, _, _ = self.newest
+        points = None if tracked.scan is None else tracked.information
+        return ScanBelief(points, partial(_covariance, pose.T_keyscan_base, tracked, self.motion.model))
+
+    @property
+    def lacks_odometry(self) -> bool:
+        """Whether scan matching alone gives the motion."""
+        return self.motion is not self.odometry
+
+    @property
+    def odometry_fault(self) -> str | None:
+        """Why the odometry does not count, as the end of a sentence."""
+        return self.odometry.check.fault
+
+    @property
     def travel_m(self) -> float:
         """Path length of the present session up to its newest keyscan, metres; turns count a little."""
         return self._session.lidar.travel_m
@@ -119,6 +142,11 @@ class RobotFrontend:
     def failure(self) -> str | None:
         """Why the back end ended early; None if it works."""
         return self.packets.failure
+
+    @property
+    def awaited(self) -> "Future[list[Body]] | None":
+        """Done when the back end has handled everything so far; None if it has."""
+        return self.packets.newest
 
     @property
     def jumps(self) -> int:
@@ -301,3 +329,7 @@ class RobotFrontend:
 
     def _submit(self, input: BackendInput) -> "Future[list[Body]]":
         return self.packets.submit(input, self._session.epoch, self.scan_poses)
+
+
+def _covariance(motion: FloatArray, tracked: TrackedScan, odometry: OdometryModel) -> FloatArray:
+    return np.asarray(np.linalg.inv(motion_information(motion, tracked, odometry)), np.float64)

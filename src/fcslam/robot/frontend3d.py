@@ -4,10 +4,16 @@ Packets are those of a robot with a 2D laser, with motions in six degrees of fre
 2D laser would see above the floor makes its keyscans.
 """
 
+import math
 from collections import deque
+from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from fcslam.errors import FeatureError
 from fcslam.features.birdseye import DETECTOR_VERSION, describe
 from fcslam.geometry import se3
 from fcslam.geometry.groups import SE3
@@ -15,12 +21,13 @@ from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.voxel_map import columns
 from fcslam.lidar3d.ground import levelled, seen_by
 from fcslam.lidar3d.local_maps import KeyframeMotion, Keyframes, MappedTurn, SurfaceMap, SurfaceMaps
-from fcslam.lidar3d.tracker import SETTLED, Tracked, Tracker3d
+from fcslam.lidar3d.tracker import SETTLED, Tracked, Tracker3d, inverse
 from fcslam.records import (
     Channel,
     CloudScan,
     Constraint,
     ConstraintKind,
+    DetectorFile,
     FloatArray,
     Keyscan,
     KeyscanId,
@@ -30,15 +37,33 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.robot.backend import SessionConfig
-from fcslam.robot.track import ScanTrack
+from fcslam.robot.track import ScanBelief, ScanTrack
 from fcslam.sources.clouds_in_space import BAND_LASER
 from fcslam.sources.gate import MAX_STEP_BACK_S
 from fcslam.wire.messages import Body, Hello, Packet
 from fcslam.wire.quantisation import rounded
 
 
+class NewestTurn(NamedTuple):
+    """The tracker's result for the newest turn; fields as in ``NewestScan``."""
+
+    pose: ScanPose
+    tracked: Tracked
+    covariance: FloatArray
+    """Of the motion since the last keyscan, in its tangent, shape (6, 6)."""
+    quality: float = math.nan
+
+    @property
+    def is_deferred(self) -> bool:
+        """Whether the surfaces explain it badly, so that it may be cut off."""
+        return self.tracked.is_poor
+
+
 class RobotFrontend3d:
     """Turns the sensor records of a robot into packets; the poses of all turns stay on the robot."""
+
+    scans = CloudScan
+    """As in ``RobotFrontend``."""
 
     def __init__(self, robot: str, config: SessionConfig, floor: str = "") -> None:
         """Start the first session, on ``floor``; empty: it has no name."""
@@ -47,10 +72,13 @@ class RobotFrontend3d:
         """Poses of the turns, by session."""
         self.jumps, self.backlog, self.failure = 0, 0, None
         """As in ``RobotFrontend``: turns are registered whatever the odometry says, and there is no back end."""
-        self.newest: Tracked | None = None
+        self.newest: NewestTurn | None = None
         """The newest turn; None before the first."""
         self.mapped: tuple[MappedTurn, FloatArray] | None = None
         """The newest keyframe, and ``T_odom_ground`` there, shape (7,); None before the first."""
+        self.awaited = None
+        """As in ``RobotFrontend``."""
+        self.lacks_odometry, self.odometry_fault = True, None
         self._describes = Channel.LIDAR in config.channels
         self._packets: deque[Packet] = deque()
         self._time = self._stamp = self._certain_s = -np.inf
@@ -70,6 +98,21 @@ class RobotFrontend3d:
     def travel_m(self) -> float:
         """Path length of the present session up to its newest keyframe, metres."""
         return 0.0 if self._keyframes.newest is None else self._keyframes.newest.travel_m
+
+    @property
+    def belief(self) -> ScanBelief:
+        """Of the newest turn."""
+        assert self.newest is not None
+        return ScanBelief(self.newest.tracked.measured, partial(np.array, self.newest.covariance))
+
+    def set_detector(self, file: DetectorFile, path: Path) -> Future[list[Body]]:  # noqa: ARG002
+        """As in ``RobotFrontend``; a robot without a camera takes none."""
+        refused: Future[list[Body]] = Future()
+        refused.set_exception(FeatureError("a robot with a 3D LiDAR uses no camera"))
+        return refused
+
+    def place_keyframes(self) -> None:
+        """As in ``RobotFrontend``: there are no images."""
 
     def process(self, record: SensorRecord) -> list[Packet]:
         """Process the next record of the recording; returns the packets that are ready."""
@@ -113,13 +156,14 @@ class RobotFrontend3d:
         self._stamp = self._certain_s = -np.inf
 
     def _track(self, scan: CloudScan) -> None:
-        tracked = self.newest = self._tracker.track(scan)
+        tracked = self._tracker.track(scan)
+        self.lacks_odometry = not len(scan.wheels)
         self._poor = self._poor + 1 if tracked.is_poor else 0
         if self._poor > SETTLED:  # the surfaces do not explain where it is any more
             self.scan_poses.cut(self._certain_s)
             self.begin_session()
             self._stamp = scan.stamp
-            tracked = self.newest = self._tracker.track(scan)
+            tracked = self._tracker.track(scan)
         if not self._poor:
             self._certain_s = scan.stamp
         self._time = max(self._time, scan.stamp)
@@ -129,7 +173,10 @@ class RobotFrontend3d:
         if keyframe is not None:
             self._map(keyframe, motion, scan.stamp)
         T_keyframe_base = se3.between(newest.T_odom_base, tracked.T_odom_base)
-        self.scan_poses.add(ScanPose(scan.stamp, newest.number, T_keyframe_base))
+        pose = ScanPose(scan.stamp, newest.number, T_keyframe_base)
+        self.scan_poses.add(pose)
+        covariance = self._keyframes.covariance if motion is None else inverse(motion.information)
+        self.newest = NewestTurn(pose, tracked, covariance)
 
     def _map(self, keyframe: MappedTurn, motion: KeyframeMotion | None, stamp: float) -> None:
         local_map = self._local_maps.add(keyframe)

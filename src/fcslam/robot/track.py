@@ -1,7 +1,8 @@
 """The poses of a robot's scans in one session. They stay on the robot."""
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,15 @@ from numpy.typing import NDArray
 from fcslam.geometry.groups import SE2, Group
 from fcslam.lidar.frontend import ScanPose
 from fcslam.records import FloatArray
+
+
+class ScanBelief(NamedTuple):
+    """How sure a front end is of the pose of its newest scan."""
+
+    points: FloatArray | None
+    """Information of the scan's points over x, y and more; None if the robot stands still."""
+    covariance: Callable[[], FloatArray]
+    """Gives the covariance of the motion since the last keyscan, in its tangent, shape (d, d)."""
 
 
 class ScanTrack:
@@ -54,8 +64,11 @@ class ScanTrack:
 
     def in_odom(self, pose: ScanPose) -> FloatArray:
         """``T_odom_base`` of a scan whose keyscan is in this track, shape (P,), metres and radians."""
-        first = self._size * pose.keyscan
-        return self._group.compose(np.array(self._T_odom_keyscan[first : first + self._size]), pose.T_keyscan_base)
+        return self._group.compose(self.keyscan_in_odom(pose.keyscan), pose.T_keyscan_base)
+
+    def keyscan_in_odom(self, number: int) -> FloatArray:
+        """Pose of a keyscan in ``odom``, shape (P,), metres and radians."""
+        return np.array(self._T_odom_keyscan[self._size * number : self._size * (number + 1)])
 
     @property
     def stamps(self) -> FloatArray:

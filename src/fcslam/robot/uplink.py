@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from fcslam.wire.http_transport import HttpTransport
 from fcslam.wire.limits import BYTES_PER_AXIS, KEYPOINT_AXES
 from fcslam.wire.messages import Body, Packet
 from fcslam.wire.packets import encode
+
+if TYPE_CHECKING:
+    from fcslam.robot.frontend3d import RobotFrontend3d
 
 BURST_S = 10.0
 """Seconds of the budget that may be spent in advance: a place is sent in one packet."""
@@ -40,7 +44,7 @@ class Uplink:
 
     def __init__(
         self,
-        frontend: RobotFrontend,
+        frontend: "RobotFrontend | RobotFrontend3d",
         outbox: Outbox,
         transport: HttpTransport,
         folder: Path,
@@ -152,8 +156,8 @@ class Uplink:
 class Budget:
     """A limit of bytes per second of the recording's own clock, so the same recording always sends the same packets.
 
-    Hello, keyscans and constraints are always sent, as without them there is no map; so are tags and fixes. Places get
-    the rest of the budget: they are sent with all their descriptors, with the strongest ones, or not at all.
+    Hello, keyscans, constraints and voxel maps are always sent, as without them there is no map; so are tags and fixes.
+    Places get the rest of the budget: they are sent with all their descriptors, with the strongest ones, or not at all.
     """
 
     def __init__(self, bytes_per_s: float) -> None:
@@ -197,7 +201,7 @@ class DetectorUpdates:
     A resumed recording switches at the same records again, so that it produces the same packets.
     """
 
-    def __init__(self, folder: Path, outbox: Outbox, frontend: RobotFrontend) -> None:
+    def __init__(self, folder: Path, outbox: Outbox, frontend: "RobotFrontend | RobotFrontend3d") -> None:
         """``folder`` holds the files; the outbox records when each was applied, also before an interruption."""
         self._folder, self._outbox, self._frontend = folder, outbox, frontend
         self._fetched: queue.SimpleQueue[DetectorFile] = queue.SimpleQueue()
