@@ -14,7 +14,7 @@ from fcslam.cli import main
 from fcslam.errors import CloudError, InputError, SourceError
 from fcslam.live.served_map import fetch_maps
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_stem, map_yaml, pgm_bytes
-from fcslam.mission.localization import read_map
+from fcslam.mission.localization import read_finished, read_map
 from fcslam.page.report import ShownRun
 from fcslam.page.routes import run_page
 from fcslam.runs import RobotTrajectory, Run
@@ -73,6 +73,15 @@ def test_the_copy_has_the_maps_of_the_cloud_with_their_floors(floors, tmp_path, 
     assert (copied.resolution_m, copied.origin_xy, copied.floor) == (0.05, (-3.0, -2.0), floor)
     with pytest.raises(SourceError, match="has maps of several floors"):
         read_map(tmp_path / "copy")
+
+
+def test_the_copy_of_a_map_in_space_has_its_points(tmp_path):
+    run = run_of([(building(160), ""), (building(90), "")])
+    replace(run, map_files=run.map_files | {"map.ply": b"points"}).save(tmp_path / "run")
+    with served(tmp_path / "run") as url:
+        assert fetch_maps(tmp_path / "copy", Server(url)) is None
+    assert {path.name for path in (tmp_path / "copy").glob("*.ply")} == {"map.ply"}
+    assert read_finished(tmp_path / "copy").ply == b"points"
 
 
 def test_an_earlier_copy_serves_while_the_cloud_cannot_be_reached(floors, tmp_path):

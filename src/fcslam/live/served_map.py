@@ -49,9 +49,9 @@ def _read(client: MapClient, server: str) -> Run:
         if not served:
             raise SourceError(f"{server}: has no map yet; let a robot send its scans first")
         files = {
-            f"{map_stem(one.number)}.{suffix}": content
+            f"{map_stem(one.number)}.{suffix}": client.file(one.number, suffix)
             for one in served
-            for suffix, content in (("yaml", client.file(one.number, "yaml")), ("pgm", client.file(one.number, "pgm")))
+            for suffix in ("yaml", *["ply"] * one.in_space, "pgm")
         }
         if all(_fits(one, files, server) for one in served):
             # The poses stay in the cloud.

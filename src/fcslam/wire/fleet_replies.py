@@ -82,6 +82,7 @@ class ServedMap(_Reply):
     number: int = Field(alias="map")
     floor: str = Field(description="floor of its robots; empty: none")
     robots: tuple[str, ...]
+    in_space: bool = Field(False, description="whether it has points in space")
     extent_m: tuple[float, ...] | None = Field(
         alias="extent", description="lowest x and y, highest x and y, metres; null before there is a map"
     )

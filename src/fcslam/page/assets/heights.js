@@ -46,7 +46,7 @@ function cloudOf(index) {
 }
 export function forgetHeights() { clouds.clear(); }
 
-export const heightText = (value) => `${value.toFixed(1).replace("-", "−")} m`;
+export const heightText = (value) => `${(Math.round(10 * value) / 10 + 0).toFixed(1).replace("-", "−")} m`;
 // The slider, and where it is at first.
 function showCut(index, { points: { z } }) {
   const slider = at("height"), low = z[0], high = z.at(-1);
