@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from fcslam.config import parse
 from fcslam.errors import InputError
 from fcslam.lidar.frontend import LidarConfig
-from fcslam.lidar.own_body import body_sectors, is_in_sectors
+from fcslam.lidar.own_body import body_radius_m, body_sectors, is_in_sectors
 from fcslam.records import LaserModel, frozen
 from fcslam.robot.calibrating import bodies_of
 from fcslam.robot.mapped_scans import MappedScans
@@ -43,6 +43,12 @@ def test_what_is_proposed_up_to_the_front_is_a_setting(post):
     hidden = is_in_sectors(LASER, ((post[0], post[1] - 0.5),))
     assert is_in_sectors(LASER, (sector,))[hidden].all()
     assert np.count_nonzero(is_in_sectors(LASER, (sector,))) <= np.count_nonzero(hidden) + 4
+
+
+def test_the_radius_of_the_body_is_that_of_its_farthest_return():
+    assert body_radius_m(SCANS, LASER) == 0.0
+    assert body_radius_m(with_posts(posts=((0, 5),)), LASER) == pytest.approx(0.5, abs=0.01)
+    assert body_radius_m(with_posts(posts=((180, 185),)), LASER) == pytest.approx(0.1, abs=0.01)
 
 
 def test_walls_and_short_or_straight_drives_propose_nothing():

@@ -8,7 +8,9 @@ import pytest
 
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
+from fcslam.lidar.frontend import LidarConfig
 from fcslam.records import LaserScan
+from fcslam.robot.calibrating import calibrated
 from fcslam.sources import BagOptions, open_source
 from fcslam.sources.inspection import inspect
 from tests.sources.bag_messages import ROS2, odom, quaternion, save, scan, tf
@@ -171,7 +173,8 @@ def test_a_cloud_in_another_unit_is_refused_with_what_to_check(tmp_path, unit):
 )
 def test_a_body_that_is_wider_than_usual_is_left_out_with_a_note(tmp_path, columns, angles):
     deck = np.stack((0.7 * np.cos(angles), 0.7 * np.sin(angles), np.full(len(angles), -0.1)), axis=1)
-    source = open_source(save(tmp_path / "deck.mcap", drive(8.6, 0.4, REALSENSE, deck, columns=columns)))
+    bag = open_source(save(tmp_path / "deck.mcap", drive(8.6, 0.4, REALSENSE, deck, columns=columns)))
+    source = calibrated(bag, LidarConfig())
     assert any("from the base belong to the robot and are left out" in note for note in source.survey().notes)
     assert min(np.nanmin(each.ranges_m) for each in scans_of(source)) > 0.75
 

@@ -1,7 +1,6 @@
 """A written bag reads back the same, and other programs can read it."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -54,10 +53,6 @@ def test_what_is_written_reads_back_to_the_last_bit(tmp_path_factory, records, n
     write_bag(path, records)
     source = open_source(path)
     written = only_scans(records)
-    if 2 * sum(after.stamp < before.stamp for before, after in pairwise(written)) > len(written):
-        with pytest.raises(SourceError, match="time runs backwards"):
-            source.survey()
-        return
     read = scans_of(source)
     assert len(read) == len(written)
     for before, after in zip(written, read, strict=True):

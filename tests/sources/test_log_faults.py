@@ -34,7 +34,6 @@ def written(path: Path, content: bytes) -> Path:
         (b"\x1f\x8b\x08\x00garbage", "truncated or damaged"),
         (b"\xfd7zXZ\x00garbage", "truncated or damaged"),
         (b"BZh9garbage", "cannot be read"),
-        (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n", "is a pointer of Git LFS"),
     ],
 )
 def test_what_is_no_recording_is_refused(tmp_path, content, reason):
@@ -66,11 +65,9 @@ def test_a_truncated_archive_is_refused_wherever_it_ends(tmp_path, compress, kep
     [
         ([odom(k, pose_at(k)) for k in range(30)], "no laser scan"),
         (drive(30) + drive(31, 200, 9), "line 62: 31 scans are not of the laser of the first ones"),
-        (3 * drive(300), "line 602"),
-        (drive(50)[::-1], "backwards"),
         (drive(12) + ["??!"] * 30, "damaged"),
     ],
-    ids=["no scan", "another laser", "three in one", "reversed", "damaged"],
+    ids=["no scan", "another laser", "damaged"],
 )
 def test_a_log_that_cannot_be_mapped_is_refused_with_the_reason(tmp_path, lines, words):
     assert words in refusal(save(tmp_path / "run.log", lines))

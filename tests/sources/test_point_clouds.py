@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from fcslam.lidar.scan import point_scan
-from fcslam.records import Beams, LaserModel
+from fcslam.records import LaserModel
 from fcslam.sources.bags.camera import calibration_of
 from fcslam.sources.bags.clouds import cloud_of, given_cloud_mounting
 from fcslam.sources.bags.codec import IMAGE, LIVOX_CLOUDS, POINT_CLOUD, MessageCodec
 from fcslam.sources.point_clouds import (
     DIRECTIONS,
-    BodySample,
     CloudBand,
     CloudMounting,
     directions_in,
@@ -101,17 +100,6 @@ def test_the_returns_of_a_sparse_scanner_are_neighbours(columns, directions, clo
     assert np.median(errors) < 0.02
     laser = LaserModel(*scan.beams, 100.0, (0.0, 0.0, 0.0))
     assert point_scan(scan.raw_ranges_m, laser).normals.any(axis=1).mean() > 0.8
-
-
-@pytest.mark.parametrize("directions", [DIRECTIONS, DIRECTIONS // 2])
-def test_the_body_is_measured_whichever_direction_a_scan_begins_with(directions):
-    sample, spacing = BodySample(), math.tau / directions
-    for number in range(40):
-        first = 9 * number - directions // 2
-        ranges = np.full(directions, 2.0 + 0.1 * number, np.float32)
-        ranges[(directions // 2 - first) % directions] = 1.0  # behind
-        sample.add((float(number), 0.0, 0.5 * number), Beams(directions, first * spacing, spacing), ranges)
-    assert sample.radius_m((0.3, 0.0, 0.0)) == pytest.approx(0.7)
 
 
 @pytest.mark.parametrize("wrong_s", [60.0, 4.2, 0.5, -1.0, math.nan])

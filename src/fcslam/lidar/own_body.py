@@ -104,21 +104,38 @@ def moved_or_turned(first: LaserScan, scan: LaserScan) -> tuple[bool, bool]:
 
 def body_sectors(scans: Iterable[LaserScan]) -> Sectors:
     """Sectors in which a laser sees the robot itself: they stay as they are while it drives and turns."""
-    places = list(islice(scans_apart(scans), MOST_PLACES))
-    turns = np.array([scan.T_odom_base[2] for scan in places])
-    if len(places) < FEWEST_PLACES or np.hypot(np.cos(turns).mean(), np.sin(turns).mean()) > SHARPEST:
-        return ()
-    ranges_m = np.stack([by_degree(scan) for scan in places])
-    middle_m = np.median(ranges_m, axis=0)
-    near = middle_m < LARGEST_BODY_M
-    steady = np.mean(np.abs(ranges_m[:, near] - middle_m[near]) < SAME_M, axis=0) > STEADY
-    own = np.flatnonzero(near)[steady]
+    own = np.flatnonzero(np.isfinite(_own_m(scans)))
     if not len(own):
         return ()
     parts = np.split(own, np.flatnonzero(np.diff(own) > LARGEST_GAP_DEG) + 1)
     if len(parts) > 1 and parts[0][0] + 360 - parts[-1][-1] <= LARGEST_GAP_DEG:
         parts[0] = np.concatenate((parts.pop() - 360, parts[0]))
     return tuple(_sector(int(part[0]) - MARGIN_DEG, int(part[-1]) + 1 + MARGIN_DEG) for part in parts)
+
+
+def body_radius_m(scans: Iterable[LaserScan], laser: LaserModel) -> float:
+    """Distance from the base to the farthest return of the robot itself in the scans of a laser; 0 without one."""
+    own_m = _own_m(scans)
+    own = np.flatnonzero(np.isfinite(own_m))
+    x, y, _ = laser.T_base_laser
+    headings = np.radians(own + 0.5)
+    return float(np.hypot(x + own_m[own] * np.cos(headings), y + own_m[own] * np.sin(headings)).max(initial=0.0))
+
+
+def _own_m(scans: Iterable[LaserScan]) -> FloatArray:
+    """The range of the robot itself in each degree, as in ``by_degree``; infinity where it is not seen."""
+    own_m = np.full(360, np.inf)
+    places = list(islice(scans_apart(scans), MOST_PLACES))
+    turns = np.array([scan.T_odom_base[2] for scan in places])
+    if len(places) < FEWEST_PLACES or np.hypot(np.cos(turns).mean(), np.sin(turns).mean()) > SHARPEST:
+        return own_m
+    ranges_m = np.stack([by_degree(scan) for scan in places])
+    middle_m = np.median(ranges_m, axis=0)
+    near = middle_m < LARGEST_BODY_M
+    steady = np.mean(np.abs(ranges_m[:, near] - middle_m[near]) < SAME_M, axis=0) > STEADY
+    own = np.flatnonzero(near)[steady]
+    own_m[own] = middle_m[own]
+    return own_m
 
 
 def _sector(first_deg: int, last_deg: int) -> tuple[float, float]:

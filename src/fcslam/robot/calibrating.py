@@ -15,7 +15,7 @@ from fcslam.lidar.calibration import Estimate, MotionCalibration, OdometryTrack,
 from fcslam.lidar.facing import AS_STATED, MOST_COMPARED, Contradiction, contradicted_facing
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.leaning import floor_line
-from fcslam.lidar.own_body import body_sectors
+from fcslam.lidar.own_body import SAME_M, body_radius_m, body_sectors
 from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.predicted_motion import PREDICTED, MotionPrediction
@@ -46,6 +46,8 @@ LARGEST_SCALE: Final = 2.0
 """Odometry that turns more or less than the scans by a larger factor measures something else."""
 LONGEST_PERIOD_S: Final = 0.12
 """Odometry that comes more seldom says nothing about delays: it is interpolated."""
+LONGEST_INTERVAL_S: Final = 0.25
+"""Scans that come more seldom are tracked less well without odometry."""
 LEAST_DELAY_S: Final = 0.02
 LEAST_YAW_RAD: Final = 0.005
 LEAST_OFFSET_M: Final = 0.02
@@ -182,6 +184,12 @@ def _calibrate_finely(bag: "RosBag", config: LidarConfig) -> Calibrated:
         by_scans = OdometryTrack(motions.stamps[known], _unwrapped(motions.T_local_base[known]))
         calibration = MotionCalibration(sweep_share=calibrate(motions, by_scans).sweep_share)
     scale = calibration.turn_scale
+    if not calibration.is_related and assumed_s <= LONGEST_INTERVAL_S and not _is_wrong(scale):
+        line = (
+            "the turns of the scans are not those of the odometry; check that the ranges are distances in metres, and "
+            "that both are of one robot; not corrected"
+        )
+        return Calibrated(calibration, BagCorrection(), (line,))
     if scale is not None and not 1.0 / LARGEST_SCALE < scale.value < LARGEST_SCALE:
         return Calibrated(calibration, BagCorrection(), tuple(_scale_lines(calibration, survey.lasers[0].beams)))
     if odometry is not None and odometry.period_s > LONGEST_PERIOD_S:
@@ -263,6 +271,10 @@ def calibrated(source: Source, config: LidarConfig) -> Source:
     if bag is None:
         said = contradictions_of(source)
         return Noted(source, tuple(f"{line}; not corrected" for line in said)) if said else source
+    of_clouds = [model for model, its in zip(bag.survey().lasers, bag.plan.lasers, strict=True) if its.is_level]
+    radius_m = max((body_radius_m(_scans_of(laser, bag), laser) for laser in of_clouds), default=0.0)
+    if radius_m > bag.options.cloud_band.body_radius_m:
+        bag = bag.without_body(radius_m + SAME_M)
     found = calibrate_bag(bag, config)
     lines = tuple(f"{bag.path}: {line}" for line in found.lines)
     return bag.corrected(found.correction, lines) if lines else bag

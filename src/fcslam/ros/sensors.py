@@ -344,7 +344,7 @@ class LiveSensors:
         assert plan is not None  # nothing is read before
         if isinstance(item, ImuReading):
             self._axes = self._axes or ImuAxes(self.planner.tree, self.planner.base_frame)
-            yield from self._recorded(reader.turn(*self._axes.turn(item, self._imu_ahead_s)))
+            reader.gyro.add(*self._axes.turn(item, self._imu_ahead_s))
             return
         if isinstance(item, OdometryReading):
             if plan.edge not in (None, (item.odom_frame, item.base_frame)):

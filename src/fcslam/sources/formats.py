@@ -17,18 +17,11 @@ from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_e
 from fcslam.sources.logs.carmen import is_carmen
 from fcslam.sources.logs.carmen_log import CarmenLog
 from fcslam.sources.source import Source
-from fcslam.untrusted import open_file
 
 if TYPE_CHECKING:
     from fcslam.sources.bags.rosbag import RosBag
 
 LOG, BAG = "CARMEN log", "ROS bag"
-_OTHERS: tuple[tuple[bytes, str], ...] = (
-    (b"version https://git-lfs", "is a pointer of Git LFS and not the recording; fetch that by `git lfs pull`"),
-    (b"/annex/objects/", "is a pointer of git-annex and not the recording; fetch that by `git annex get`"),
-)
-"""How other files begin, and what they are and what to do."""
-_FEW_BYTES = 512
 _SCANS_SHARED = 20
 """Scans that two recordings share at least if they overlap."""
 
@@ -149,7 +142,6 @@ def format_of(path: Path) -> str:
                 raise SourceError(f"{part}: a {LOG} is not a part of several; give one recording, or parts of a bag")
         return BAG
     content = b"" if is_folder(path) else head(path)
-    _refuse_others(path, content)
     if is_carmen(content):
         return LOG
     with translate_errors(path):
@@ -161,13 +153,3 @@ def format_of(path: Path) -> str:
     if path.name == "metadata.yaml":
         raise SourceError(f"{path}: describes a bag; give its folder, {path.parent}")
     raise SourceError(f"{path}: not a recording of a known format; give a {known}")
-
-
-def _refuse_others(path: Path, content: bytes) -> None:
-    for magic, what in _OTHERS:
-        if content.startswith(magic):
-            raise SourceError(f"{path}: {what}")
-    if not content:
-        for file in filter(Path.is_file, (*path.glob("*.mcap"), *path.glob("*.db3"))):
-            with translate_errors(file), open_file(file) as stream:
-                _refuse_others(file, stream.read(_FEW_BYTES))

@@ -3,9 +3,9 @@
 - Steps back in time. The clocks of one robot disagree by up to a second (the Intel log has 631 steps back, the largest
   0.9 s). Scans stay in file order, in which the odometry is consistent. A scan more than 2 s before both preceding
   scans is misplaced and skipped (both, because one of them may have a damaged stamp far ahead). A recording with more
-  than 1 % misplaced scans, or with more than half of its steps back in time, is rejected.
-- A clock that steps back once, and stays there for ten scans, is kept from the tenth on: a robot begins a new session
-  there (``is_clock_step``). A second such step makes the scans after it misplaced.
+  than 1 % misplaced scans is rejected.
+- A clock that steps back, and stays there for ten scans, is kept from the tenth on: a robot begins a new session there
+  (``is_clock_step``).
 - Beams. The beams of one laser may vary from scan to scan; ``geometry.beams.misfit`` decides whether a scan can be of
   the laser. One that cannot is skipped. A recording in which these are the majority is rejected.
 - Equal stamps are kept. Some logs were printed with too few digits or without a clock.
@@ -52,7 +52,6 @@ class ScanGate:
         """Stamps of the two preceding scans."""
         self._misplaced: list[tuple[int, float]] = []
         """Numbers and stamps of the newest misplaced scans in a row."""
-        self._has_stepped = False
 
     def admits(self, number: int, stamp: float, beams: Beams | None) -> bool:
         """Whether the scan on line (or in message) ``number`` is consistent; counts its faults.
@@ -67,10 +66,9 @@ class ScanGate:
             if self._misplaced and not 0.0 <= stamp - self._misplaced[-1][1] <= MAX_STEP_BACK_S:
                 self._misplaced.clear()
             self._misplaced.append((number, stamp))
-            if self._has_stepped or len(self._misplaced) < FEWEST:
+            if len(self._misplaced) < FEWEST:
                 self._audit.add(Fault.MISPLACED_SCAN, number, step_s=step_back_s)
                 return False
-            self._has_stepped = True
             self._audit.add(Fault.CLOCK_STEP, self._misplaced[0][0], step_s=step_back_s)
         elif step_back_s > 0.0:
             self._audit.add(Fault.TIME_REVERSAL, number, step_s=step_back_s)
@@ -106,9 +104,7 @@ def scan_window(
 def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_count: int, first_errors: str = "") -> None:
     """Reject a recording with too many inconsistent or damaged scans; ``first_errors`` say what is damaged."""
     broken = sum(faults[kind].count for kind in (Fault.BROKEN_LINE, Fault.BROKEN_MESSAGE))
-    other, misplaced, reversals = (
-        faults[kind] for kind in (Fault.OTHER_BEAMS, Fault.MISPLACED_SCAN, Fault.TIME_REVERSAL)
-    )
+    other, misplaced = faults[Fault.OTHER_BEAMS], faults[Fault.MISPLACED_SCAN]
     if broken > scan_count + odometry_count:
         raise SourceError(
             f"{path}: most {faults.unit}s are damaged{first_errors}, {faults}; copy or export the recording again"
@@ -121,11 +117,6 @@ def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_coun
     skipped_at_step = (FEWEST - 1) * faults[Fault.CLOCK_STEP].count
     if misplaced.count - skipped_at_step > TOLERATED_SHARE * scan_count:
         raise SourceError(
-            f"{path}: {faults.unit} {misplaced.first_line}: time jumps back by up to {misplaced.largest_s:.6g} s, as "
-            "if two recordings had been put together; cut it there and give both parts"
-        )
-    if 2 * reversals.count > scan_count:
-        raise SourceError(
-            f"{path}: {faults.unit} {reversals.first_line}: time runs backwards in {reversals.count} of {scan_count} "
-            "scans; give the recording in the order in which it was made"
+            f"{path}: {faults.unit} {misplaced.first_line}: time jumps back by up to {misplaced.largest_s:.6g} s, "
+            "again and again; record it with one clock"
         )

@@ -1,5 +1,6 @@
 """The motion of a robot during a scan, from the odometry around it."""
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from math import hypot
 from typing import Final
@@ -77,10 +78,12 @@ class OdometryUpdates:
 def moving_sweep(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> Sweep:
     """The sweep with the motion by odometry: the least-squares fit of a constant acceleration, or none if it jumps.
 
-    ``readings`` are those up to the scan and beyond it, the newest last; those of a clock that stepped back are left
-    out.
+    ``readings`` are those up to the scan and beyond it, in the order of their stamps.
     """
-    near = _around(sweep, stamp, readings)
+    first_s, last_s = stamp + min(0.0, sweep.first_s, sweep.last_s), stamp + max(0.0, sweep.first_s, sweep.last_s)
+    end = bisect_left(readings, last_s, key=_stamp_of)
+    begin = min(bisect_right(readings, first_s, key=_stamp_of), end, len(readings) - 1) - 1
+    near = readings[max(0, begin) : end + 1]
     if len(near) < 2:
         return sweep
     stamps, poses = np.array([reading.stamp for reading in near]), np.array([reading.T_odom_base for reading in near])
@@ -103,16 +106,5 @@ def moving_sweep(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> Swe
     return sweep._replace(velocity=(vx, vy, vtheta), acceleration=(ax, ay, atheta))
 
 
-def _around(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> list[Reading]:
-    first_s, last_s = stamp + min(0.0, sweep.first_s, sweep.last_s), stamp + max(0.0, sweep.first_s, sweep.last_s)
-    near: list[Reading] = []
-    for reading in reversed(readings):
-        if near and reading.stamp >= near[-1].stamp:
-            break
-        if reading.stamp >= last_s:
-            near.clear()
-        near.append(reading)
-        if reading.stamp <= first_s and len(near) > 1:
-            break
-    near.reverse()
-    return near
+def _stamp_of(reading: Reading) -> float:
+    return reading.stamp

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from fcslam.geometry import se2
 from fcslam.records import Beams, FloatArray, Ranges, Sweep
 from fcslam.sources.bags.messages import ScanMessage
-from fcslam.sources.pose import Pose
-from fcslam.sources.returns import is_apart
 
 DIRECTIONS: Final = 720
 """In a full turn, at most."""
@@ -62,9 +60,6 @@ _LEAST_EXTENT_M = 0.15
 
 LARGEST_BODY_M: Final = 1.5
 """Farther returns are not of the robot."""
-_FEWEST_PLACES, _MOST_PLACES = 20, 200
-_STEADY = 0.95
-"""Share of the places at which a return of the robot has the same range."""
 
 _SLOTS = 90
 """Parts of a turn in time whose directions show how the scanner turns."""
@@ -267,35 +262,6 @@ def _fitted(plane: Plane, points: FloatArray) -> Plane | None:
         return None
     normal = axes[:, 0] * np.copysign(1.0, axes[2, 0])
     return normal, float(normal @ middle)
-
-
-class BodySample:
-    """Finds the robot in its scans: returns that stay where they are while the robot drives and turns."""
-
-    def __init__(self) -> None:
-        self._places: list[tuple[Pose, Ranges]] = []
-
-    def add(self, T_odom_base: Pose, beams: Beams, ranges_m: Ranges) -> None:
-        """Add a scan; only those at different places are kept."""
-        if len(self._places) < _MOST_PLACES and (not self._places or is_apart(self._places[-1][0], T_odom_base)):
-            first = round(beams.angle_min_rad / beams.angle_increment_rad)
-            self._places.append((T_odom_base, np.roll(ranges_m, first)))
-
-    def radius_m(self, T_base_laser: Pose) -> float:
-        """Distance of the farthest such return from the origin of ``base``; 0 without one."""
-        if len(self._places) < _FEWEST_PLACES:
-            return 0.0
-        headings = np.array([pose[2] for pose, _ in self._places])
-        if np.hypot(np.cos(headings).mean(), np.sin(headings).mean()) > _SHARPEST:
-            return 0.0
-        ranges_m = np.where(np.isfinite(ranges := np.stack([each for _, each in self._places])), ranges, FARTHEST_M)
-        middle_m = np.median(ranges_m, axis=0)
-        steady = np.mean(np.abs(ranges_m - middle_m) < SAME_SURFACE_M, axis=0) > _STEADY
-        body = np.flatnonzero(steady & (middle_m < LARGEST_BODY_M))
-        x, y, heading_rad = T_base_laser
-        angles = heading_rad + body * (tau / len(middle_m))
-        distances_m = np.hypot(x + middle_m[body] * np.cos(angles), y + middle_m[body] * np.sin(angles))
-        return float(distances_m.max(initial=0.0))
 
 
 def _moved(points: FloatArray, times_s: FloatArray, motion: Sweep) -> FloatArray:

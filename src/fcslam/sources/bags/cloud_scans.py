@@ -25,7 +25,7 @@ from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.topics import calibration_beside
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, is_fixed
 from fcslam.sources.gate import FIRST_MESSAGES
-from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud, directions_in, leaning, scan_of_cloud
+from fcslam.sources.point_clouds import CloudMounting, PointCloud, directions_in, leaning, scan_of_cloud
 
 _CLOUDS_TRIED = 10 * FIRST_MESSAGES
 """First clouds over which those are spread that show the floor and the directions of the sensor."""
@@ -70,16 +70,16 @@ class BagScans:
 
     def of(self, topic: Topic) -> Iterator[ScanMessage]:
         """The valid scans of a topic."""
-        return valid(self._robot.bag.read([topic]), lambda message: self.scan(message, self._options.cloud_band))
+        return valid(self._robot.bag.read([topic]), self.scan)
 
-    def scan(self, message: BagMessage, band: CloudBand) -> ScanMessage:
+    def scan(self, message: BagMessage) -> ScanMessage:
         """The scan of a message; raises ValueError if it is invalid."""
         topic, content = message.topic, message.content
         if topic.type in LASER_SCANS:
             scan: ScanMessage = content
             return scan
         cloud = self.cloud(message)
-        return scan_of_cloud(cloud, self.mounting(topic, cloud.frame), band)
+        return scan_of_cloud(cloud, self.mounting(topic, cloud.frame), self._options.cloud_band)
 
     def mounting(self, topic: Topic, frame: str) -> CloudMounting:
         """Where the sensor with this frame sits, corrected by the floor that it sees."""

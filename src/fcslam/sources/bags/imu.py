@@ -1,20 +1,17 @@
 """The readings of an IMU in a bag or of a live robot: sensor_msgs/Imu."""
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from fcslam.records import FloatArray, Transform, frozen
-from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.codec import IMU
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.messages import OdometryReading, ScanMessage, header_of
-from fcslam.sources.bags.pairing import MAX_GAP_S, Entry, Message, PosedImage, PosedScan
+from fcslam.sources.bags.messages import header_of
 from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree
-from fcslam.sources.pose import UNKNOWN_POSE
 
 _LARGEST_RATE: Final = 35.0
 """A gyro that measures more, rad/s, is broken."""
@@ -73,58 +70,22 @@ class ImuAxes:
         return stamp - ahead_s, rate_rad_s
 
 
-class GyroPairing:
-    """Gives each scan of a robot without odometry the readings of its gyro since the scan before, if it has one.
-
-    A scan waits for the readings during its sweep, but not for a gyro that is silent, nor longer than the next scan
-    takes.
-    """
+class GyroReadings:
+    """The readings of a gyro that no scan of its robot, which has no odometry, was given yet."""
 
     def __init__(self, turns: Iterable[tuple[float, float]] = ()) -> None:
         """``turns`` are the readings that are known: stamps, and angular velocities about the vertical."""
         self._turns = deque(turns)
-        self._newest_s = self._turns[-1][0] if self._turns else -np.inf
-        self._queue: deque[tuple[int, ScanMessage | ImageMessage]] = deque()
+        self._is_there = bool(self._turns)
 
-    @property
-    def waiting(self) -> int:
-        """Number of scans and images that wait."""
-        return len(self._queue)
-
-    def turn(self, stamp: float, rate_rad_s: float) -> Iterator[tuple[int, Entry]]:
-        """Add a reading; yields what waits no longer."""
+    def add(self, stamp: float, rate_rad_s: float) -> None:
+        """Add the next reading."""
         self._turns.append((stamp, rate_rad_s))
-        self._newest_s = stamp
-        yield from self._complete()
+        self._is_there = True
 
-    def add(self, number: int, item: Message) -> Iterator[tuple[int, Entry]]:
-        """Add the next scan or image; yields those that wait no longer, in their order."""
-        if not isinstance(item, OdometryReading):
-            self._queue.append((number, item))
-            yield from self._complete()
-
-    def flush(self) -> Iterator[tuple[int, Entry]]:
-        """Yield all that wait."""
-        while self._queue:
-            number, item = self._queue.popleft()
-            if isinstance(item, ImageMessage):
-                yield number, PosedImage(item, None)
-            else:
-                yield number, PosedScan(item, UNKNOWN_POSE, None, self._taken(item.end + _AFTER_S))
-
-    def _complete(self) -> Iterator[tuple[int, Entry]]:
-        item = self._queue[-1][1] if self._queue else None
-        if isinstance(item, ScanMessage) and item.stamp - MAX_GAP_S < self._newest_s < item.end:
-            latest = self._queue.pop()
-            yield from self.flush()
-            self._queue.append(latest)
-        else:
-            yield from self.flush()
-
-    def _taken(self, until_s: float) -> FloatArray | None:
-        if not np.isfinite(self._newest_s):
-            return None
+    def take(self, end_s: float) -> FloatArray | None:
+        """The readings for a scan that ends at ``end_s``, shape (K, 2); None if there is no gyro."""
         taken: list[tuple[float, float]] = []
-        while self._turns and self._turns[0][0] <= until_s:
+        while self._turns and self._turns[0][0] <= end_s + _AFTER_S:
             taken.append(self._turns.popleft())
-        return frozen(np.array(taken).reshape(-1, 2))
+        return frozen(np.array(taken).reshape(-1, 2)) if self._is_there else None

@@ -1,8 +1,8 @@
 """Assigns odometry to scans and images at their own stamps.
 
 Poses are interpolated between two readings; a scan with exactly the stamp of a reading gets that reading's pose.
-Odometry may come later than the scan, so scans wait for it in the order of the recording. The two readings are those
-nearest in the recording, not in time, so that a step back of the clock does not mix earlier and later readings.
+Odometry may come later than the scan, so scans wait for it in the order of the recording. Where the clock of the
+odometry steps back, earlier readings do not count any more.
 
 A reading that was recorded a little late, after one with a later stamp, counts at its time.
 
@@ -10,10 +10,10 @@ Before the first and after the last reading, and where the odometry's clock step
 nearest reading within 1 s, or none.
 """
 
+from bisect import bisect_right, insort
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 from fcslam.records import FloatArray
@@ -26,8 +26,8 @@ from fcslam.sources.pose import Pose, interpolated_pose
 MAX_GAP_S = 1.0
 """Largest time between a scan and a reading outside of which it has no odometry."""
 
-_LATE_S, _MOST_LATE = 0.15, 3
-"""A reading may be recorded so long after one with a later stamp, and so many in a row, as over a network."""
+_LATE_S = 0.15
+"""A reading may be recorded so long after one with a later stamp, as over a network."""
 _LONGEST_QUEUE = 1000
 """Most past readings that are searched for a scan, and most waiting items; beyond, the oldest one waits no longer."""
 
@@ -70,11 +70,10 @@ class OdometryPairing:
     """Pairs items as they come; each waits until the odometry at its stamp is known."""
 
     def __init__(self) -> None:
-        self._readings: deque[OdometryReading] = deque(maxlen=_LONGEST_QUEUE)
+        self._readings: list[OdometryReading] = []
+        """Those of the present clock, in the order of their stamps."""
         self._queue: deque[_QueuedItem] = deque()
         self._updates = OdometryUpdates()
-        self._late = 0
-        """Newest readings in a row that are earlier than the newest one in time."""
 
     @property
     def waiting(self) -> int:
@@ -85,27 +84,20 @@ class OdometryPairing:
         """Add the next item; yields those that wait no longer, in their order."""
         readings, queue = self._readings, self._queue
         if isinstance(item, OdometryReading):
-            if self._is_late(item.stamp):
-                _insert(readings, item)
-            elif self._updates.is_fresh(item.stamp, item.T_odom_base):
-                around = [readings[-1], item] if readings else [item]
-                steps_back = item.stamp < around[0].stamp
-                readings.append(item)
+            if readings and item.stamp < readings[-1].stamp - _LATE_S:  # the clock stepped back
                 for waiting in queue:
-                    stamp = waiting.item.stamp
-                    waiting.match = waiting.match or (
-                        _nearest_pose(around, stamp) if steps_back else _look_back(readings, stamp)
-                    )
+                    waiting.match = waiting.match or _nearest_pose((readings[-1], item), waiting.item.stamp)
+                readings[:] = [item]
+            elif (readings and item.stamp < readings[-1].stamp) or self._updates.is_fresh(item.stamp, item.T_odom_base):
+                insort(readings, item, key=_stamp_of)
+                for waiting in queue:
+                    waiting.match = waiting.match or _match(readings, waiting.item.stamp)
+            del readings[:-_LONGEST_QUEUE]
             queue.append(_QueuedItem(number, item, (item.T_odom_base, None)))
         else:
-            queue.append(_QueuedItem(number, item, _look_back(readings, item.stamp)))
+            queue.append(_QueuedItem(number, item, _match(readings, item.stamp)))
         while queue and (self._is_complete(queue[0]) or len(queue) > _LONGEST_QUEUE):
             yield _with_pose(queue.popleft(), readings)
-
-    def _is_late(self, stamp: float) -> bool:
-        is_back = bool(self._readings) and 0.0 < self._readings[-1].stamp - stamp <= _LATE_S
-        self._late = self._late + 1 if is_back else 0
-        return 0 < self._late <= _MOST_LATE
 
     def _is_complete(self, waiting: _QueuedItem) -> bool:
         """Whether the odometry at the stamp and, for a scan, during its sweep is known.
@@ -124,7 +116,7 @@ class OdometryPairing:
             yield _with_pose(self._queue.popleft(), self._readings)
 
 
-def _with_pose(waiting: _QueuedItem, readings: deque[OdometryReading]) -> tuple[int, Entry]:
+def _with_pose(waiting: _QueuedItem, readings: list[OdometryReading]) -> tuple[int, Entry]:
     if isinstance(waiting.item, OdometryReading):
         return waiting.number, waiting.item
     match = waiting.match or _nearest_pose(readings, waiting.item.stamp)
@@ -137,32 +129,21 @@ def _with_pose(waiting: _QueuedItem, readings: deque[OdometryReading]) -> tuple[
     return waiting.number, PosedScan(scan, T_odom_base, fault)
 
 
-def _insert(readings: deque[OdometryReading], late: OdometryReading) -> None:
-    after = [readings.pop()]
-    while readings and late.stamp < readings[-1].stamp <= after[-1].stamp:
-        after.append(readings.pop())
-    readings.extend((late, *reversed(after)))
+def _stamp_of(reading: OdometryReading) -> float:
+    return reading.stamp
 
 
-def _look_back(readings: deque[OdometryReading], stamp: float) -> _PoseMatch | None:
+def _match(readings: list[OdometryReading], stamp: float) -> _PoseMatch | None:
+    """The pose at a stamp; None if it is later than all readings."""
     if not readings or stamp > readings[-1].stamp:
         return None
-    if stamp == readings[-1].stamp:
-        return (readings[-1].T_odom_base, None)
-    oldest = readings[-1]
-    for after, before in pairwise(reversed(readings)):
-        if before.stamp > after.stamp:
-            break
-        if before.stamp <= stamp:
-            return _between(before, after, stamp)
-        oldest = before
-    return _nearest_pose([oldest], stamp)
-
-
-def _between(before: OdometryReading, after: OdometryReading, stamp: float) -> _PoseMatch:
-    for reading in (after, before):
-        if stamp == reading.stamp:
-            return (reading.T_odom_base, None)
+    at = bisect_right(readings, stamp, key=_stamp_of)
+    if at == 0:
+        return _nearest_pose(readings[:1], stamp)
+    before = readings[at - 1]
+    if before.stamp == stamp:
+        return (before.T_odom_base, None)
+    after = readings[at]
     span_s = after.stamp - before.stamp
     pose = interpolated_pose(before.T_odom_base, after.T_odom_base, (stamp - before.stamp) / span_s)
     return (pose, Fault.ODOMETRY_GAP if span_s > MAX_GAP_S else None)

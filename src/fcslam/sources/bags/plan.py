@@ -28,7 +28,6 @@ from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree, is_
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
-from fcslam.sources.point_clouds import CloudBand
 
 _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
@@ -87,10 +86,10 @@ class BagPlan(NamedTuple):
         odometry = () if self.odometry is None else self.odometry.topics
         return list(dict.fromkeys((*odometry, *self.topics.scans, *camera)))
 
-    def items(self, message: BagMessage, band: CloudBand, correction: BagCorrection) -> list[Message]:
+    def items(self, message: BagMessage, correction: BagCorrection) -> list[Message]:
         """The scans, readings and images in a message; raises ValueError if it is invalid."""
         if message.topic in self.topics.scans:
-            scan = self.scans.scan(message, band)
+            scan = self.scans.scan(message)
             if correction.sweep is not None and scan.ranges_at_stamp is None:
                 first_s, last_s = correction.sweep
                 scan = scan._replace(sweep=Sweep(first_s, last_s) if first_s != last_s else None)
@@ -161,7 +160,7 @@ class _Planner:
     def _first_error(self, topic: Topic) -> str:
         for message in islice(self._bag.read([topic]), 1):
             try:
-                self._scans.scan(message, self._options.cloud_band)
+                self._scans.scan(message)
             except ValueError as error:
                 return f" ({error})"
         return ""
@@ -244,8 +243,7 @@ class _Planner:
 
     @cached_property
     def _scans_lags_s(self) -> list[float]:
-        band = self._options.cloud_band
-        return self._lags_s(self._topics.scans[:1], lambda message: [self._scans.scan(message, band).end])
+        return self._lags_s(self._topics.scans[:1], lambda message: [self._scans.scan(message).end])
 
     def _lags_s(self, topics: Sequence[Topic], ends_of: Callable[[BagMessage], list[float]]) -> list[float]:
         """Times from the measurement to the recording of the first messages."""

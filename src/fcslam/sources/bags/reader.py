@@ -8,13 +8,15 @@ ends; a live robot asks which lasers are silent, and does not wait for them, or 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 
-from fcslam.sources.bags.imu import GyroPairing
+from fcslam.sources.bags.camera import ImageMessage
+from fcslam.sources.bags.imu import GyroReadings
 from fcslam.sources.bags.messages import ScanMessage
-from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedScan
+from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedImage, PosedScan
 from fcslam.sources.bags.rig import RecordedLaser
 from fcslam.sources.bags.sectors import SectorJoiner
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import ScanGate
+from fcslam.sources.pose import UNKNOWN_POSE
 
 _LONGEST_QUEUE = 20
 """Most scans of one laser that wait for scans of the others; beyond, another laser has paused."""
@@ -79,7 +81,9 @@ class SensorReader:
         """``audit`` counts the faults; ``turns`` are readings of the gyro of a robot without odometry."""
         self._joiners = {number: SectorJoiner() for number, laser in enumerate(lasers) if laser.is_in_sectors}
         self._merger = ScanMerger(len(lasers))
-        self._pairing = OdometryPairing() if has_odometry else GyroPairing(turns)
+        self._pairing = OdometryPairing() if has_odometry else None
+        self.gyro = GyroReadings(turns)
+        """What the gyro of a robot without odometry measured."""
         self._gates, self._audit = [ScanGate(laser.first.beams, audit) for laser in lasers], audit
         self._number = 0
 
@@ -108,12 +112,7 @@ class SensorReader:
     @property
     def waits_for_odometry(self) -> bool:
         """Whether scans or images wait."""
-        return self._pairing.waiting > 0
-
-    def turn(self, stamp: float, rate_rad_s: float) -> Iterator[Numbered]:
-        """Read the angular velocity about the vertical by the gyro of a robot without odometry."""
-        if isinstance(self._pairing, GyroPairing):
-            yield from self._admitted(self._pairing.turn(stamp, rate_rad_s))
+        return self._pairing is not None and self._pairing.waiting > 0
 
     def skip_lasers(self) -> Iterator[Numbered]:
         """Wait no longer for the silent lasers, until they send again."""
@@ -121,11 +120,17 @@ class SensorReader:
 
     def skip_odometry(self) -> Iterator[Numbered]:
         """Give what waits for odometry the nearest pose, or none."""
-        yield from self._admitted(self._pairing.flush())
+        if self._pairing is not None:
+            yield from self._admitted(self._pairing.flush())
 
     def _posed(self, items: Iterable[tuple[int, Message]]) -> Iterator[Numbered]:
         for number, item in items:
-            yield from self._admitted(self._pairing.add(number, item))
+            if self._pairing is not None:
+                yield from self._admitted(self._pairing.add(number, item))
+            elif isinstance(item, ScanMessage):
+                yield from self._admitted([(number, PosedScan(item, UNKNOWN_POSE, None, self.gyro.take(item.end)))])
+            elif isinstance(item, ImageMessage):
+                yield number, PosedImage(item, None)
 
     def _admitted(self, entries: Iterable[Numbered]) -> Iterator[Numbered]:
         """The consistent entries; counts the faults of the rest. A scan without odometry is not consistent."""

@@ -32,7 +32,6 @@ from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.path_summary import PathSummary
-from fcslam.sources.point_clouds import SAME_SURFACE_M, BodySample, CloudBand
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
@@ -46,8 +45,6 @@ _OF_CLOUDS = "that its points are in metres, its mounting in tf and the heights 
 class _Reading(NamedTuple):
     survey: Survey
     rig: Rig
-    band: CloudBand
-    """The points of clouds that count."""
     placeholders: tuple[tuple[float, ...], ...]
     base_frame: str
 
@@ -98,7 +95,7 @@ class RosBag:
         if scans == WHOLE:
             return whole
         audit, track = _audit(), PathSummary()
-        for _, entry in scan_window(self._entries(audit, self._reading.band), scans, _is_scan, audit):
+        for _, entry in scan_window(self._entries(audit), scans, _is_scan, audit):
             if isinstance(entry, PosedScan):
                 track.add(entry.scan.stamp, entry.T_odom_base)
         return Survey(
@@ -116,7 +113,7 @@ class RosBag:
         fixes = deque(found)
         for kind, fault in faults.counts.items():
             audit.add(kind, fault.first_line, fault.count)
-        entries = self._entries(audit, self._reading.band, with_images=rig.camera is not None, turns=self._turns)
+        entries = self._entries(audit, with_images=rig.camera is not None, turns=self._turns)
         for number, entry in scan_window(entries, scans, _is_scan, audit):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
@@ -157,7 +154,6 @@ class RosBag:
     def _entries(
         self,
         audit: Audit,
-        band: CloudBand,
         errors: dict[str, str] | None = None,
         with_images: bool = False,
         turns: Iterable[tuple[float, float]] = (),
@@ -166,7 +162,7 @@ class RosBag:
         reader = SensorReader(plan.lasers, plan.odometry is not None, audit, turns)
         for message in self.bag.read(plan.read_topics(with_images)):
             try:
-                items = plan.items(message, band, self.options.correction)
+                items = plan.items(message, self.options.correction)
             except ValueError as error:
                 errors.setdefault(message.topic.name, f"message {message.number} of it: {error}")
                 is_image = message.topic == plan.topics.camera
@@ -187,19 +183,16 @@ class RosBag:
     @cached_property
     def _reading(self) -> _Reading:
         audit, errors, plan = _audit(), dict[str, str](), self.plan
-        tree, lasers, band = plan.tree, plan.lasers, self.options.cloud_band
+        tree, lasers = plan.tree, plan.lasers
         scans, odometry = PathSummary(), PathSummary()
         samples = [RangeSample() for _ in lasers]
-        bodies = [BodySample() for _ in lasers]
         farthest_m = [laser.first.range_max_m for laser in lasers]
         base_frame = self.options.base_frame or ""
         self._count_broken_transforms(audit, errors)
-        for _, entry in self._entries(audit, band, errors):
+        for _, entry in self._entries(audit, errors):
             if isinstance(entry, PosedScan):
                 laser = entry.scan.laser
                 farthest_m[laser] = max(farthest_m[laser], entry.scan.range_max_m)
-                if lasers[laser].is_level:
-                    bodies[laser].add(entry.T_odom_base, entry.scan.beams, entry.scan.raw_ranges_m)
                 if (sample := samples[laser]).wants(entry.T_odom_base):
                     scan = entry.scan
                     sample.add(entry.T_odom_base, scan.raw_ranges_m, scan.range_min_m, scan.range_max_m)
@@ -214,13 +207,6 @@ class RosBag:
         placeholders = tuple(sample.placeholders() for sample in samples)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
         mountings = [_moved(mounted, self.options.correction) for mounted in self._mountings(base_frame, errors)]
-        radius_m = max(body.radius_m(its.T_base_laser) for body, its in zip(bodies, mountings, strict=True))
-        body_notes = []
-        if radius_m > band.body_radius_m:
-            band = band._replace(body_radius_m=radius_m + SAME_SURFACE_M)
-            body_notes = [
-                f"{self.path}: points up to {radius_m:.2f} m from the base belong to the robot and are left out"
-            ]
         camera, camera_note = None, ""
         if plan.topics.camera is not None:
             camera, camera_note = mounted_camera(plan.calibration, tree, base_frame)
@@ -234,7 +220,6 @@ class RosBag:
             ),
             *chain.from_iterable(laser.notes(self.path, self.options.cloud_band) for laser in lasers),
             *plan.scans.notes,
-            *body_notes,
             *chain.from_iterable(map(placeholder_note, repeat(self.path), placeholders, which)),
             *self.robot.notes,
             *plan.topics.notes,
@@ -251,7 +236,7 @@ class RosBag:
         survey = Survey(
             scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), (*self._notes, *notes), camera
         )
-        return _Reading(survey, rig, band, placeholders, base_frame)
+        return _Reading(survey, rig, placeholders, base_frame)
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary, errors: Mapping[str, str]) -> None:
         path, topics, (laser, *_) = self.path, self.plan.topics, self.plan.lasers
@@ -299,6 +284,12 @@ class RosBag:
         correction = replace(correction, floors=correction.floors or self.options.correction.floors)
         options = replace(self.options, correction=correction)
         return RosBag(self.path, self.name, options, (*self._notes, *notes), self.robot)
+
+    def without_body(self, radius_m: float) -> "RosBag":
+        """The same bag without the points of clouds that are nearer to the base, as they are of the robot."""
+        options = replace(self.options, cloud_band=self.options.cloud_band._replace(body_radius_m=radius_m))
+        note = f"{self.path}: points up to {radius_m:.2f} m from the base belong to the robot and are left out"
+        return RosBag(self.path, self.name, options, (*self._notes, note), self.robot)
 
     def robots(self, name: str | None = None) -> "list[RosBag]":
         """The robots of the bag, or the one that is chosen, named as in it; ``name`` stands for the bag."""
