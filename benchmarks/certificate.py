@@ -138,23 +138,28 @@ def members_of(run: Run) -> dict[int, list[str]]:
 def judged(run: Run, k: int, building: str, group: str, estimate: FloatArray, truth: FloatArray) -> Iterator[JudgedMap]:
     """Bounds and true errors of the cells of one map, given estimated and true poses (N, 3) of its robots."""
     certificate = json.loads(run.quality.get("quality.json", b"{}")).get(str(k))
+    if certificate is None or not certificate["cells"]:
+        return
+    places, error_m = bends(estimate, truth)
+    if len(places) < 10:
+        return
+    centres = np.array([(cell["x"], cell["y"]) for cell in certificate["cells"]])
+    bound_m = np.array([cell["bound_95"] for cell in certificate["cells"]])
+    yield JudgedMap(building, group, bound_m, error_m[cKDTree(places).query(centres)[1]])
+
+
+def bends(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places about 1 m apart, shape (P, 2), and the errors of the map around them, shape (P,), by poses (N, 3)."""
     known = np.isfinite(truth[:, 0])
-    if certificate is None or not certificate["cells"] or not known.any():
-        return
     estimate, truth = estimate[known], truth[known]
-    squares = np.floor(estimate[:, :2] / CELL_M).astype(np.int64)
-    kept = np.unique(squares, axis=0, return_index=True)[1]
+    kept = np.unique(np.floor(estimate[:, :2] / CELL_M).astype(np.int64), axis=0, return_index=True)[1]
     estimate, truth = estimate[kept], truth[kept]
-    if len(kept) < 10:
-        return
-    error_m, tree = np.zeros(len(estimate)), cKDTree(estimate[:, :2])
-    for row, near in enumerate(tree.query_ball_point(estimate[:, :2], WITHIN_M)):
+    error_m = np.zeros(len(kept))
+    for row, near in enumerate(cKDTree(estimate[:, :2]).query_ball_point(estimate[:, :2], WITHIN_M)):
         if len(near) > 2:
             T = align(truth[near], estimate[near])
             error_m[row] = np.sqrt((position_errors(T, truth[near], estimate[near]) ** 2).mean())
-    centres = np.array([(cell["x"], cell["y"]) for cell in certificate["cells"]])
-    bound_m = np.array([cell["bound_95"] for cell in certificate["cells"]])
-    yield JudgedMap(building, group, bound_m, error_m[tree.query(centres)[1]])
+    return estimate[:, :2], error_m
 
 
 def row(title: str, maps: list[JudgedMap], factor: float = 1.0) -> tuple:

@@ -332,7 +332,7 @@ def test_a_report_tells_of_days_of_changes_and_of_accuracy(browser, tmp_path):
         closing(context.new_page()) as page,
     ):
         page.goto(f"file://{tmp_path / 'report.html'}")
-        says(page, "#verdicts", "Use this map.")
+        says(page, "#verdicts", "accurate to 3 cm within 10 m")
         page.locator("#layers summary").click()
         page.wait_for_timeout(500)
         assert pixels(page, [APPEARED]) == [0]

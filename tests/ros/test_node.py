@@ -19,7 +19,7 @@ from fcslam.ros.sensors import STEPS_BACK_FOR_RESTART
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
 from fcslam.sources.bags.transforms import in_space
-from fcslam.wire.fleet_replies import Apart, FrontierReply, MapFrontiers, QualityReply, TeammatePose
+from fcslam.wire.fleet_replies import FrontierReply, MapFrontiers, QualityReply, TeammatePose
 from tests import small_fleet
 from tests.live.same_thread import SameThread
 from tests.ros.memory_network import MemoryNetwork, offered
@@ -317,9 +317,6 @@ class FollowedFleet:
             TeammatePose(robot="3", map=1, floor="up", pose=(0.0, 0.0, 0.0), age_s=0.0, stamp=0.0),
         ]
 
-    def separations(self):
-        return (Apart(maps=(0, 1), explanation="no two of their places look alike"),)
-
 
 class FleetRobot:
     """A robot whose joint map is more than its own."""
@@ -371,7 +368,6 @@ def test_poses_and_state_of_the_fleet_are_published_and_each_change_once(network
     status = {one.name: one for one in network.sent["/robot1/fleet/status"][0].status}
     values = {pair.key: pair.value for pair in status["robot r-2"].values}
     assert (values["map"], values["age_s"], values["x"]) == ("0", "1.50", "1.0000")
-    assert status["maps 0 and 1"].message == "no two of their places look alike"
     events = [one.status[0] for one in network.sent["/diagnostics"] if one.status[0].name.endswith("fleet")]
     assert [event.message for event in events] == followed.fleet.news
 

@@ -17,17 +17,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Column
-from rich.text import Text
 
 from fcslam.cli.output import print_line
-
-LEAST_DONE_PERCENT = 10.0
-"""Before this, the first items, which compile code or are short, say nothing about the others."""
-
-
-class _TimeLeft(TimeRemainingColumn):
-    def render(self, task: Task) -> Text:
-        return super().render(task) if task.percentage >= LEAST_DONE_PERCENT else Text("")
 
 
 class ProgressDisplay:
@@ -40,7 +31,7 @@ class ProgressDisplay:
         console: where to show progress; nothing is shown if it is quiet.
         heading: a line to print when the first stage starts.
         interval_s: time between two plain lines at first, in seconds. It grows to a twentieth of the elapsed time and
-            at most a minute, so that logs of long runs stay short. A line without news comes a twelfth as often.
+            at most a minute, so that logs of long runs stay short.
     """
 
     def __init__(self, console: Console, heading: str = "", interval_s: float = 5.0) -> None:
@@ -48,7 +39,7 @@ class ProgressDisplay:
         self._heading = heading
         self._interval_s = interval_s
         self._is_live = console.is_terminal and not console.is_dumb_terminal and not console.quiet
-        self._count, self._elapsed, self._left = MofNCompleteColumn(), TimeElapsedColumn(), _TimeLeft()
+        self._count, self._elapsed, self._left = MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
         whole, cut = Column(no_wrap=True, overflow="ellipsis", max_width=20), Column(no_wrap=True, ratio=1)
         self._bars = Progress(
             TextColumn("{task.description}", markup=False, table_column=whole),
@@ -112,13 +103,11 @@ class ProgressDisplay:
 
     def _print_lines(self) -> None:
         began = monotonic()
-        interval_s, printed, printed_s = self._interval_s, None, began
+        interval_s = self._interval_s
         while not self._ended.wait(interval_s):
-            shown = [task for task in self._bars.tasks if task.visible and not task.finished]
-            state = [(task.id, task.completed, task.fields["details"]) for task in shown]
-            if shown and (state != printed or monotonic() >= printed_s + 12.0 * self._interval_s):
-                print_line(self._console, "; ".join(map(self._line, shown)))
-                printed, printed_s = state, monotonic()
+            line = "; ".join(self._line(task) for task in self._bars.tasks if task.visible and not task.finished)
+            if line:
+                print_line(self._console, line)
             interval_s = max(self._interval_s, min((monotonic() - began) / 20.0, 60.0))
 
     def _line(self, task: Task) -> str:

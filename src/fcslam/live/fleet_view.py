@@ -1,4 +1,4 @@
-"""What a live robot knows of its fleet: the joint map and how good it is, where the others are, why maps are apart,
+"""What a live robot knows of its fleet: the joint map and how good it is, where the others are,
 and where to explore.
 
 A thread follows the cloud. No scan waits for it, and while the cloud is away everything stays as it was last.
@@ -18,7 +18,7 @@ from fcslam.records import FloatArray
 from fcslam.robot.sender import ASK_AFTER_S, retry_delay_s
 from fcslam.robot.uplink import STOP_TIMEOUT_S
 from fcslam.wire.fleet_client import FleetClient
-from fcslam.wire.fleet_replies import Apart, FleetReply, MapFrontiers, QualityReply, TeammatePose
+from fcslam.wire.fleet_replies import FleetReply, MapFrontiers, QualityReply, TeammatePose
 
 POLL_S: Final = 0.5
 """Time between two looks at the fleet."""
@@ -106,10 +106,6 @@ class FleetView:
         reply, came_s = self._reply
         since_s = self.clock() - came_s
         return [one.model_copy(update={"age_s": one.age_s + since_s}) for one in reply.robots]
-
-    def separations(self) -> tuple[Apart, ...]:
-        """For every two maps that are apart: their indices and the reason."""
-        return () if self._reply is None else self._reply[0].separations
 
     def step(self) -> None:
         """Ask once."""

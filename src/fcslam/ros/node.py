@@ -190,7 +190,7 @@ class RobotNode:
             if fleet is None:
                 return
             now_ns = self._clock.now_ns()
-            self._outputs.fleet(now_ns, fleet.robots(), fleet.separations(), fleet.map_index)
+            self._outputs.fleet(now_ns, fleet.robots(), fleet.map_index)
             if fleet.frontiers is not frontiers:
                 frontiers = fleet.frontiers
                 self._publish_frontiers(now_ns, fleet)

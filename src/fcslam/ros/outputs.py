@@ -18,7 +18,7 @@ from fcslam.sources.bags.codec import TRANSFORMS, MessageCodec
 from fcslam.sources.bags.transforms import in_space
 
 if TYPE_CHECKING:
-    from fcslam.wire.fleet_replies import Apart, QualityReply, TeammatePose
+    from fcslam.wire.fleet_replies import QualityReply, TeammatePose
 
 GRID, POSE, PATH = "nav_msgs/OccupancyGrid", "geometry_msgs/PoseWithCovarianceStamped", "nav_msgs/Path"
 MARKERS, DIAGNOSTICS = "visualization_msgs/MarkerArray", "diagnostic_msgs/DiagnosticArray"
@@ -154,13 +154,11 @@ class Outputs:
         self,
         now_ns: int,
         teammates: "Sequence[TeammatePose]",
-        separations: "Sequence[Apart]",
         own: int | None,
     ) -> None:
         """Publish where the robots of the own map are, and which of all robots, this one as well, are in which map.
 
-        ``separations`` are every two maps that are apart. ``own`` is the index of the
-        robot's own map; None: no pose is in its frame.
+        ``own`` is the index of the robot's own map; None: no pose is in its frame.
         """
         make, frame = self._codec.make, self._map_frame
         with self._lock:
@@ -194,11 +192,6 @@ class Outputs:
                     },
                 )
                 for mate in teammates
-            ]
-            statuses += [
-                self._status(f"maps {a} and {b}", "", self._levels.WARN, apart.explanation, {"map_a": a, "map_b": b})
-                for apart in separations
-                for a, b in [apart.maps]
             ]
             self._diagnose(FLEET_STATUS, now_ns, statuses)
 

@@ -27,18 +27,10 @@ class TeammatePose(_Reply):
     stamp: float = Field(description="of its newest keyscan in the map, seconds")
 
 
-class Apart(_Reply):
-    """Two maps that no closure joins."""
-
-    maps: tuple[int, int]
-    explanation: str
-
-
 class FleetReply(_Reply):
-    """Where all robots are, and why maps are apart."""
+    """Where all robots are."""
 
     robots: tuple[TeammatePose, ...]
-    separations: tuple[Apart, ...]
 
 
 class FrontierReply(_Reply):

@@ -4,7 +4,6 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -19,15 +18,15 @@ from fcslam.errors import InputError
 from fcslam.maps.joint_tiles import LARGEST_ANSWER
 from fcslam.maps.occupancy_map import FARTHEST_M
 from fcslam.records import NAME
-from fcslam.runs import QUALITY, Run, separations
+from fcslam.runs import QUALITY
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
 from fcslam.service.http.responses import file_of, refusals
 from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
 from fcslam.service.joint_maps import Exploration, ServedJointMaps
-from fcslam.service.viewed_mission import run_of, viewed_run
-from fcslam.wire.fleet_replies import Apart, FleetReply, FrontierReply, MapFrontiers, QualityReply, TeammatePose
+from fcslam.service.viewed_mission import viewed_run
+from fcslam.wire.fleet_replies import FleetReply, FrontierReply, MapFrontiers, QualityReply, TeammatePose
 
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False, strict=True)]
 
@@ -84,7 +83,7 @@ def joint_map_router(state: ServiceState) -> APIRouter:
                     stamp=session.stamp,
                 )
             )
-        return FleetReply(robots=tuple(robots), separations=_apart(run_of(state.mission)))
+        return FleetReply(robots=tuple(robots))
 
     @router.get("/robots/{robot}/map", dependencies=as_reader, **file_of(NETWORK, is_tagged=True))
     def get_joint_map(
@@ -175,8 +174,3 @@ def _summaries(explored: Exploration, robot: str | None) -> Iterator[FrontierRep
             },
             robots=tuple(sorted(name for name, goal in goals.items() if goal is one)),
         )
-
-
-@lru_cache(maxsize=2)
-def _apart(run: Run) -> tuple[Apart, ...]:
-    return tuple(Apart(maps=one.maps, explanation=str(one)) for one in separations(run))
