@@ -7,6 +7,9 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed-$(EXTRAS)
 COMPILED := $(VENV)/.compiled-$(EXTRAS)
 DEMO ?= demo
+comma := ,
+# What the demo and the commands of README need: a third of what developers need. A developer's .venv has it already.
+DEMO_EXTRAS := $(if $(wildcard $(VENV)/.installed-dev),dev,service$(comma)sim)
 SECONDS ?= 60
 # What draws the pictures of simulated cameras where there is no display and no graphics card.
 GL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
@@ -34,7 +37,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENC
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n $(shell expr $$(env -u OMP_NUM_THREADS nproc) + 1) --maxprocesses 8 --dist worksteal
 BENCHMARKS := $(filter-out benchmarks/common.py benchmarks/convert_logs.py benchmarks/processes.py benchmarks/quick.py,$(wildcard benchmarks/*.py))
 
-.PHONY: help install packages gl learning demo test test-fast test-system test-all test-training test-attack ros-test browser-test scale-test check bench bench-quick docs proto fuzz lock sbom audit
+.PHONY: help install packages gl learning demo simulated-demo test test-fast test-system test-all test-training test-attack ros-test browser-test scale-test check bench bench-quick docs proto fuzz lock sbom audit
 .DEFAULT_GOAL := help
 # Where this is set, each process of a test compiles the package and the tests anew.
 export PYTHONDONTWRITEBYTECODE :=
@@ -69,7 +72,7 @@ install: $(COMPILED)
 packages: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt
-	@echo "Installing fcslam[$(EXTRAS)] into $(VENV); the first time takes about two minutes."
+	@echo "Installing fcslam[$(EXTRAS)] into $(VENV): $(if $(findstring dev,$(EXTRAS)),2 GB,1 GB) on the disk, one to eight minutes by network and processor."
 	@$(PYTHON) -m venv $(VENV) || { echo "Install Python 3.11, 3.12 or 3.13 with its venv, or name one: make install PYTHON=..."; exit 1; }
 	@$(PIP) -e ".[$(EXTRAS)]"
 	@touch $@
@@ -89,15 +92,18 @@ gl: $(INSTALLED)
 	    $(HAS_GL) || echo "No GL library, so no cameras. To have them: sudo apt-get install $(GL_PACKAGES)"; \
 	fi
 
-# Never fails: without torch and Flower the demo leaves training out, and the tests of it are skipped.
+# Never fails: without torch and Flower the tests of training are skipped.
 learning: $(INSTALLED)
 	@if ! $(HAS_LEARNING); then \
-	    echo "Installing torch and Flower into $(VENV), for training the detector; this takes about a minute."; \
+	    echo "Installing torch and Flower into $(VENV), for training the detector: 1 GB on the disk, one to five minutes."; \
 	    { $(PIP) $(TORCH_CPU) && $(PIP) -e ".[$(EXTRAS),federated]"; } 2>/dev/null || true; \
 	    $(HAS_LEARNING) || echo "No torch or no Flower, so no training. To have them: make install EXTRAS=$(EXTRAS),federated"; \
 	fi
 
-demo: $(COMPILED) gl learning
+demo:
+	@$(MAKE) --no-print-directory EXTRAS=$(DEMO_EXTRAS) simulated-demo
+
+simulated-demo: $(COMPILED) gl
 	@$(BIN)/fcslam demo --output $(DEMO) $$($(HAS_GL) || echo --no-camera)
 
 test: $(COMPILED)

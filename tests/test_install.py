@@ -89,7 +89,7 @@ def test_every_extra_is_named_where_it_is_needed():
     named = re.findall(r'extra(?:: str = |=)"(\w+)"', hints) + re.findall(r"fcslam\[(\w+)\]", hints)
     assert extras == set(named) - {"forbid", "ignore"}  # words of pydantic
     pages = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").rglob("*.md"))
-    shown = re.findall(r"pip install ['\"]?(?:\.|fcslam)\[([\w,]+)\]", pages)
+    shown = re.findall(r"pip install (?:-e )?['\"]?(?:\.|fcslam)\[([\w,]+)\]", pages)
     assert {extra for extras_of_one in shown for extra in extras_of_one.split(",")} == extras
 
 

@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -78,12 +79,22 @@ def open_recording(
 
 
 def named_path(argument: str) -> tuple[Path, str | None]:
-    """Path and name in ``LOG`` or ``NAME=LOG``; an existing file is never read as ``NAME=LOG``."""
+    """Path and name in ``LOG`` or ``NAME=LOG``; an existing file is never read as ``NAME=LOG``.
+
+    A path that is not there is refused here, before code is loaded and compiled to read it.
+    """
     name, equals, path = argument.partition("=")
     # Path.exists raises for a name that is too long, and in a folder that cannot be searched.
     if not equals or not name or os.path.exists(argument):
-        return Path(argument), None
-    return Path(path), name
+        name, path = "", argument
+    with suppress(PermissionError):
+        try:
+            os.stat(path)
+        except (FileNotFoundError, NotADirectoryError):
+            raise InputError(f"{path}: no such file; check the path of the recording") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error}); check the path of the recording") from error
+    return Path(path), name or None
 
 
 class LiveSource(NamedTuple):

@@ -98,6 +98,9 @@ def map_recordings(
     workers: WorkersOption = "1",
 ) -> None:
     """Map recordings of several robots into one map, with the trajectory of every robot and all closures."""
+    recordings = [named_path(log) for log in logs or ()]
+    if not recordings and onto is None:
+        raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
     with _without_collection():
         from fcslam.anchoring.anchors import read_anchors
         from fcslam.api import in_3d, split_recordings
@@ -114,12 +117,8 @@ def map_recordings(
         settings = with_starts(mission_config(config, continued_config(earlier), in_space), start)
         anchors = read_anchors(plan, plan_scale, tags)
         options = in_3d(bag_options(sensors), settings)
-        if not logs and onto is None:
-            raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
         with compiled(notices(quiet)):
-            opened = [
-                calibrated(source, settings.robot.lidar) for source in open_fleet(map(named_path, logs or ()), options)
-            ]
+            opened = [calibrated(source, settings.robot.lidar) for source in open_fleet(recordings, options)]
         sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
     with verifying(workers) as verify:

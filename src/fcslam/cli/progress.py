@@ -17,8 +17,17 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Column
+from rich.text import Text
 
 from fcslam.cli.output import print_line
+
+LEAST_DONE_PERCENT = 10.0
+"""Before this, the first items, which compile code or are short, say nothing about the others."""
+
+
+class _TimeLeft(TimeRemainingColumn):
+    def render(self, task: Task) -> Text:
+        return super().render(task) if task.percentage >= LEAST_DONE_PERCENT else Text("")
 
 
 class ProgressDisplay:
@@ -31,7 +40,7 @@ class ProgressDisplay:
         console: where to show progress; nothing is shown if it is quiet.
         heading: a line to print when the first stage starts.
         interval_s: time between two plain lines at first, in seconds. It grows to a twentieth of the elapsed time and
-            at most a minute, so that logs of long runs stay short.
+            at most a minute, so that logs of long runs stay short. A line without news comes a twelfth as often.
     """
 
     def __init__(self, console: Console, heading: str = "", interval_s: float = 5.0) -> None:
@@ -39,7 +48,7 @@ class ProgressDisplay:
         self._heading = heading
         self._interval_s = interval_s
         self._is_live = console.is_terminal and not console.is_dumb_terminal and not console.quiet
-        self._count, self._elapsed, self._left = MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+        self._count, self._elapsed, self._left = MofNCompleteColumn(), TimeElapsedColumn(), _TimeLeft()
         whole, cut = Column(no_wrap=True, overflow="ellipsis", max_width=20), Column(no_wrap=True, ratio=1)
         self._bars = Progress(
             TextColumn("{task.description}", markup=False, table_column=whole),
@@ -103,11 +112,13 @@ class ProgressDisplay:
 
     def _print_lines(self) -> None:
         began = monotonic()
-        interval_s = self._interval_s
+        interval_s, printed, printed_s = self._interval_s, None, began
         while not self._ended.wait(interval_s):
-            line = "; ".join(self._line(task) for task in self._bars.tasks if task.visible and not task.finished)
-            if line:
-                print_line(self._console, line)
+            shown = [task for task in self._bars.tasks if task.visible and not task.finished]
+            state = [(task.id, task.completed, task.fields["details"]) for task in shown]
+            if shown and (state != printed or monotonic() >= printed_s + 12.0 * self._interval_s):
+                print_line(self._console, "; ".join(map(self._line, shown)))
+                printed, printed_s = state, monotonic()
             interval_s = max(self._interval_s, min((monotonic() - began) / 20.0, 60.0))
 
     def _line(self, task: Task) -> str:
