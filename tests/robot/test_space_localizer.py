@@ -114,14 +114,22 @@ def test_a_robot_stands_on_the_floor_with_its_inclination():
 
 
 @pytest.mark.parametrize(
-    "damage", [lambda ply: ply[:-1], lambda ply: ply + b"x", lambda ply: ply.replace(b"0.1", b"0.2"), lambda _: b""]
+    ("damage", "reason"),
+    [
+        (lambda ply: ply[:-1], "is not a file of points"),
+        (lambda ply: ply + b"x", "is not a file of points"),
+        (lambda ply: ply.replace(b"0.1", b"0.2"), "is not a file of points"),
+        (lambda _: b"", "is not a file of points"),
+        (lambda ply: ply[:-27] + np.float32(np.nan).tobytes() + ply[-23:], "has points that no map has"),
+        (lambda ply: ply[:-27] + np.float32(1e9).tobytes() + ply[-23:], "has points that no map has"),
+    ],
 )
-def test_a_file_of_points_is_read_as_it_was_written_or_refused(damage):
+def test_a_file_of_points_is_read_as_it_was_written_or_refused(damage, reason):
     points = np.array([[0, 0, 0], [5, 0, 0], [0, 5, 135]], np.int16)
     scanner, seen_from = np.array([[0, 0, 50]], np.int16), np.zeros(3, np.uint8)
     ply = ply_of([(VoxelMap(KeyscanId("a", 0), 0, 0, se3.IDENTITY, points, scanner, seen_from), se3.IDENTITY)])
     read, normals = read_points(ply, "map.ply")
     assert read == pytest.approx(0.02 * points[np.lexsort(points.T[::-1])], abs=1e-3)
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=0.02)
-    with pytest.raises(SourceError, match=r"map\.ply: is not a file of points"):
+    with pytest.raises(SourceError, match=rf"map\.ply: {reason}"):
         read_points(damage(ply), "map.ply")

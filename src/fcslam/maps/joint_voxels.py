@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
 from fcslam.geometry import se3
+from fcslam.maps.occupancy_map import FARTHEST_M
 from fcslam.records import FloatArray, VoxelMap
 
 _CELL_M: Final = 0.1
@@ -89,8 +90,8 @@ def read_points(ply: bytes, name: str) -> tuple[FloatArray, FloatArray]:
     if not len(rows) or head + mark + rows.tobytes() != ply or head + mark != _head(len(rows)):
         raise SourceError(f"{name}: is not a file of points that `fcslam map --3d` wrote; copy it again")
     points, normals = (np.column_stack([rows[c] for c in names]).astype(np.float64) for names in ("xyz", _NORMAL))
-    if not (np.isfinite(points).all() and np.isfinite(normals).all()):
-        raise SourceError(f"{name}: has points that are not finite; copy it again")
+    if not ((np.abs(points) <= FARTHEST_M).all() and np.isfinite(normals).all()):
+        raise SourceError(f"{name}: has points that no map has; copy it again")
     return points, normals
 
 
