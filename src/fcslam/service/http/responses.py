@@ -182,7 +182,7 @@ class MapVerdictSummary(StrictModel):
     use: Use = Field(description="`use` it, use it with a `reserve`, or `wait`: do not use it yet")
     sentence: str = Field(description="the decision, its reason, and what to do next")
     details: list[str] = Field(description="further concerns, and what the decision rests on")
-    where: list[Point] = Field(description="places to look at, or between which to drive")
+    where: list[Point] = Field(description="places to look at, or between which to drive, metres")
 
 
 class DetectorSummary(StrictModel):
