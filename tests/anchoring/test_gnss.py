@@ -87,6 +87,7 @@ def test_errors_that_are_larger_than_stated_are_found():
     [
         (lambda p: p[:, ::-1], "with latitude and longitude exchanged"),
         (np.radians, "with radians for degrees"),
+        (lambda p: p * (1.0, -1.0), "with east and north exchanged, or a sign lost"),
         (lambda p: np.trunc(p) + 0.6 * (p - np.trunc(p)), "with a scale of 0.6"),
     ],
 )
@@ -184,7 +185,7 @@ def test_fixes_of_each_status_are_used_or_counted_by_the_clock_of_the_scans(tmp_
     found = [record.stamp for record in bag.records() if isinstance(record, GnssFix)]
     assert found == pytest.approx([100.0 + k for k in range(36) if k % 4 != 1], abs=0.1)
     counts = {kind: bag.faults[kind].count for kind in bag.faults.counts}
-    assert counts == {Fault.NO_FIX: 9, Fault.UNKNOWN_FIX: 18, Fault.FIX_EXCHANGED: 1}
+    assert counts == {Fault.NO_FIX: 9, Fault.UNKNOWN_FIX: 18, Fault.NO_LATITUDE: 1}
     assert "the clock of /fix is 18.0" in " ".join(bag.survey().notes)
 
 

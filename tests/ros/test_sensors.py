@@ -329,7 +329,7 @@ def test_a_fix_of_satellite_navigation_has_the_antenna_that_tf_says():
     assert [(each.stamp, each.latitude_deg, each.longitude_deg) for each in found] == expected
     assert all(each.antenna_xy == pytest.approx((-0.3, 0.2)) for each in found)
     assert robot.sensors.audit.faults()[Fault.FIX_AT_ZERO].count == 1
-    assert robot.sensors.audit.faults()[Fault.BROKEN_MESSAGE].count == 1
+    assert robot.sensors.audit.faults()[Fault.NO_LATITUDE].count == 1
 
 
 WALL_S = 1_700_000_000.0

@@ -79,6 +79,10 @@ def test_no_odometry(tmp_path, name):
     source = open_source(save(tmp_path / name, without(drive(20), "/odom")))
     (note,) = source.survey().notes
     assert "no odometry, so scan matching alone gives the motion" in note
+    assert "record them at 5 Hz" not in note
+    seldom = [each for k, each in enumerate(without(drive(100), "/odom")) if each.topic != "/scan" or k % 10 == 0]
+    (note,) = open_source(save(tmp_path / f"seldom_{name}", seldom)).survey().notes
+    assert "scans every 2 s show too little of it: record them at 5 Hz or more" in note
     scans = list(source.records())
     assert len(scans) == 20
     assert all(np.isnan(scan.T_odom_base).all() for scan in scans)

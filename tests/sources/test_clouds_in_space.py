@@ -96,7 +96,7 @@ def test_without_wheels_scans_carry_the_turns_of_the_gyro(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"scale": 1000.0}, "as if in millimetres; publish them in metres"),
+        ({"scale": 1000.0}, "as if in another unit; publish them in metres"),
         ({"rings": 1}, "has one ring, so it is a 2D laser; map it without --3d"),
     ],
 )

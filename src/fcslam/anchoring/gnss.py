@@ -206,15 +206,18 @@ def _explanation(measured: _Measured, antennas: FloatArray, positions: FloatArra
     """With which change of the coordinates clearly more than ``count`` fixes agree; empty if with none."""
     stated = replace(measured, sigma_m=measured.sigma_m / measured.factor, factor=1.0)
     size = np.hypot(*measured.east_north.std(axis=0)) / np.hypot(*antennas.std(axis=0))
-    changed = {"east and north": measured.east_north[:, ::-1], f"a scale of {size:.3g}": measured.east_north / size}
-    for name, each in (("latitude and longitude", positions[:, ::-1]), ("radians for degrees", np.degrees(positions))):
+    changed = {
+        "east and north exchanged, or a sign lost": measured.east_north[:, ::-1],
+        f"a scale of {size:.3g}": measured.east_north / size,
+    }
+    exchanged, degrees = positions[:, ::-1], np.degrees(positions)
+    for name, each in (("latitude and longitude exchanged", exchanged), ("radians for degrees", degrees)):
         if np.abs(each).max() <= 90.0:
             changed[name] = _projected(each)[1]
     for name, east_north in reversed(changed.items()):
         its, T, agreeing = _vote(replace(stated, east_north=east_north), antennas)
         if agreeing.sum() > CLEARLY_MORE * count and not _refusal(its, T, antennas, agreeing):
-            what = f"{name} exchanged" if " and " in name else name
-            return f"with {what}, {agreeing.sum()} of {len(agreeing)} agree: correct the driver of the receiver"
+            return f"with {name}, {agreeing.sum()} of {len(agreeing)} agree: correct the driver of the receiver"
     return ""
 
 

@@ -19,7 +19,7 @@ from fcslam.sources.bags.rig import (
     tilt_note,
 )
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, NoTransformError, TransformTree
-from fcslam.sources.path_summary import WITHOUT_ODOMETRY
+from fcslam.sources.path_summary import without_odometry
 
 USUAL_ODOM: Final = "odom"
 """Frame of an odometry that names none."""
@@ -146,9 +146,11 @@ class LivePlanner:
                 )
             elif enough:
                 self.is_without_odometry = True
+                first = self._first[0]
+                interval_s = (first[-1].stamp - first[0].stamp) / max(1, len(first) - 1)
                 self._notify(
-                    f"{WITHOUT_ODOMETRY}. To use odometry, start the driver of the base before the robot, or name its "
-                    "topic by --sensors odom-topic"
+                    f"{without_odometry(interval_s)}. To use odometry, start the driver of the base before the robot, "
+                    "or name its topic by --sensors odom-topic"
                 )
         return enough and (self._has_odometry or self.is_without_odometry)
 

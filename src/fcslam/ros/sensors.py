@@ -55,7 +55,7 @@ from fcslam.sources.bags.topics import info_beside
 from fcslam.sources.bags.transforms import NoTransformError
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import MAX_STEP_BACK_S
-from fcslam.sources.point_clouds import directions_in, scan_of_cloud
+from fcslam.sources.point_clouds import directions_in, scan_of_cloud, unit_problem
 
 ODOMETRY_PATIENCE_S = MAX_GAP_S
 """Time that a scan waits for its odometry."""
@@ -317,7 +317,7 @@ class LiveSensors:
             if lacks_optical_frame(T_base_sensor, kind, cloud.frame):
                 self._notify(optical_note(topic, cloud.frame))
         if topic not in self._directions:
-            for note in notes_on_times(topic, kind, [cloud]):
+            for note in filter(None, (*notes_on_times(topic, kind, [cloud]), unit_problem([cloud]))):
                 self._notify(note)
             self._directions[topic] = directions_in([cloud], mounting)
         return scan_of_cloud(cloud, mounting._replace(directions=self._directions[topic]), self._options.cloud_band)

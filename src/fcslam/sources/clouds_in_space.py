@@ -10,13 +10,20 @@ from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
 from fcslam.records import CloudScan, FloatArray, LaserModel, frozen
-from fcslam.sources.point_clouds import DIRECTIONS, FARTHEST_M, CloudBand, CloudMounting, PointCloud, floor_in, turn_of
+from fcslam.sources.point_clouds import (
+    DIRECTIONS,
+    FARTHEST_M,
+    CloudBand,
+    CloudMounting,
+    PointCloud,
+    floor_in,
+    turn_of,
+    unit_problem,
+)
 
 BAND_LASER: Final = LaserModel(DIRECTIONS // 2, -np.pi, 2.0 * tau / DIRECTIONS, FARTHEST_M)
 """The 2D laser in ``base`` that a 3D LiDAR stands for."""
 _FEWEST_POINTS: Final = 50
-_TOO_FAR_M: Final = 300.0
-"""Usual distance of points that are not in metres."""
 _ONE_RING_RAD: Final = 0.02
 """Largest spread of the elevations of the points of one ring."""
 _FLOOR_M, _FLOOR_SHARE = 0.15, 0.05
@@ -67,13 +74,10 @@ def reader_of(
     Raises:
         SourceError: they cannot be mapped.
     """
-    distances_m = [float(np.median(np.linalg.norm(cloud.points, axis=1))) for cloud in first if len(cloud.points)]
-    if not distances_m or max(len(cloud.points) for cloud in first) < _FEWEST_POINTS:
+    if max(len(cloud.points) for cloud in first) < _FEWEST_POINTS:
         raise SourceError(f"{where} has hardly any points; check the driver, or choose another by --sensors scan-topic")
-    if np.median(distances_m) > _TOO_FAR_M:
-        raise SourceError(
-            f"{where}: the points are {np.median(distances_m):.0f} m away, as if in millimetres; publish them in metres"
-        )
+    if problem := unit_problem(first):
+        raise SourceError(f"{where}: {problem}")
     if max(map(_elevations, first)) < _ONE_RING_RAD:
         raise SourceError(f"{where} has one ring, so it is a 2D laser; map it without --3d, or with its laser scans")
     notes = []

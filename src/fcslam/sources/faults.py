@@ -25,7 +25,7 @@ class Fault(StrEnum):
     REPEATED_STAMP = "scans with the stamp of the scan before"
     INVALID_RANGE = "ranges that are negative or not finite made invalid"
     FIX_AT_ZERO = "GNSS fixes at latitude 0, longitude 0 skipped"
-    FIX_EXCHANGED = "GNSS fixes with a latitude beyond 90 degrees, as if exchanged with the longitude, skipped"
+    NO_LATITUDE = "GNSS fixes with a latitude beyond 90 degrees, as of another unit or of a longitude, skipped"
     NO_FIX = "GNSS messages that state that there is no fix skipped"
     UNKNOWN_FIX = "GNSS fixes of unknown status used"
     NO_RETURN = "scans without a return, placed by odometry alone, which clear nothing"

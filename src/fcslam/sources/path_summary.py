@@ -13,6 +13,8 @@ RESOLUTION_RAD: Final = 1e-4
 """Odometry that changes by less over a whole recording never changes."""
 LEAST_TRAVEL_M: Final = 1.0
 """A robot that drove less far may not have turned at all."""
+LONGEST_INTERVAL_S: Final = 0.35
+"""Scans that come more seldom may show too little of the motion between them."""
 SIDEWAYS: Final = 0.1
 """Odometry without turns that moves sideways by a larger share of its travel has no heading."""
 
@@ -81,7 +83,10 @@ def fault_of_odometry(poses: Iterable[Pose]) -> str | None:
     return summary.fault if summary.count else "has no readable message"
 
 
-WITHOUT_ODOMETRY: Final = (
-    "no odometry, so scan matching alone gives the motion; where the scans do not fix the position, as along a bare "
-    "corridor, the distance is unknown"
-)
+def without_odometry(interval_s: float) -> str:
+    """The notice about a robot without odometry whose scans come at this interval."""
+    seldom = f", and scans every {interval_s:.1g} s show too little of it: record them at 5 Hz or more, or odometry"
+    return (
+        f"no odometry, so scan matching alone gives the motion{seldom * (interval_s > LONGEST_INTERVAL_S)}; where the "
+        "scans do not fix the position, as along a bare corridor, the distance is unknown"
+    )

@@ -28,7 +28,7 @@ _COARSEST: Final = 8
 _FEWEST_DIRECTIONS: Final = 50
 """A cloud with returns in fewer does not tell how far apart they are."""
 FARTHEST_M: Final = 100.0
-"""Farther returns are left out."""
+"""Farther returns are left out; the usual distance of points that are not in metres."""
 SAME_SURFACE_M: Final = 0.05
 """Returns that are closer, along a direction or to a plane, are of the same surface."""
 LARGEST_GAP: Final = 3
@@ -173,6 +173,14 @@ def directions_in(clouds: Iterable[PointCloud], mounting: CloudMounting) -> int:
             gaps.append(int(np.quantile(np.diff(seen), 0.1)))  # larger gaps are also where nothing is seen
     measured = min(int(np.median(gaps or [1])), _COARSEST)
     return DIRECTIONS // ceil(measured / LARGEST_GAP)
+
+
+def unit_problem(clouds: Iterable[PointCloud]) -> str:
+    """What is wrong with the unit of the points in these clouds; empty if nothing is."""
+    distances_m = [float(np.median(np.linalg.norm(cloud.points, axis=1))) for cloud in clouds if len(cloud.points)]
+    if not distances_m or (middle_m := float(np.median(distances_m))) <= FARTHEST_M:
+        return ""
+    return f"the points are {middle_m:.0f} m away, as if in another unit; publish them in metres"
 
 
 def depth_points(depth_m: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:

@@ -25,7 +25,7 @@ from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.topics import calibration_beside
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, is_fixed
 from fcslam.sources.gate import FIRST_MESSAGES
-from fcslam.sources.point_clouds import CloudMounting, PointCloud, directions_in, leaning, scan_of_cloud
+from fcslam.sources.point_clouds import CloudMounting, PointCloud, directions_in, leaning, scan_of_cloud, unit_problem
 
 _CLOUDS_TRIED = 10 * FIRST_MESSAGES
 """First clouds over which those are spread that show the floor and the directions of the sensor."""
@@ -85,6 +85,8 @@ class BagScans:
         """Where the sensor with this frame sits, corrected by the floor that it sees."""
         if (topic, frame) not in self._mountings:
             clouds = list(self._some_clouds(topic, frame))
+            if problem := unit_problem(clouds):
+                raise SourceError(f"{self._robot.bag.path}: {topic.name}: {problem}")
             mounting = self._levelled(topic, clouds, self._mounting(topic, frame))
             self._mountings[topic, frame] = mounting._replace(directions=directions_in(clouds, mounting))
             self.notes += [f"{self._robot.bag.path}: {note}" for note in notes_on_times(topic.name, topic.type, clouds)]

@@ -65,8 +65,8 @@ def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str)
     latitude, longitude, altitude = float(content.latitude), float(content.longitude), float(content.altitude)
     if latitude == 0.0 == longitude:
         return Fault.FIX_AT_ZERO
-    if abs(longitude) <= 90.0 < abs(latitude) <= 180.0:
-        return Fault.FIX_EXCHANGED
+    if abs(latitude) > 90.0:
+        return Fault.NO_LATITUDE
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):  # false for NaN
         raise ValueError(f"latitude {latitude:g}, longitude {longitude:g} are not a position on the earth")
     stamp, frame = header_of(content.header, bag_time_ns)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from itertools import chain, islice
-from math import degrees, tau
+from math import tau
 from typing import NamedTuple
 
 from fcslam.config import one_line
@@ -13,7 +13,7 @@ from fcslam.sources.bags.camera import Calibration, image_of
 from fcslam.sources.bags.census import BagMessage
 from fcslam.sources.bags.clocks import ahead_note, clock_ahead_s
 from fcslam.sources.bags.cloud_scans import BagScans, calibration_in, valid
-from fcslam.sources.bags.codec import LASER_SCANS, ODOMETRY
+from fcslam.sources.bags.codec import LASER_SCANS, NANOSECONDS, ODOMETRY
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.fixes import fix_topics
 from fcslam.sources.bags.imu import imu_topics
@@ -22,12 +22,11 @@ from fcslam.sources.bags.options import NO_ODOMETRY, BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Message
 from fcslam.sources.bags.rig import RecordedLaser, recorded_laser
 from fcslam.sources.bags.robots import BagRobot, listed, usual
-from fcslam.sources.bags.sectors import cloud_sector_rad
 from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree, is_corrected
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.gate import FIRST_MESSAGES
-from fcslam.sources.path_summary import WITHOUT_ODOMETRY, fault_of_odometry
+from fcslam.sources.path_summary import fault_of_odometry, without_odometry
 
 _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
@@ -149,12 +148,6 @@ class _Planner:
                 f"{self._path}: none of the {topic.message_count} scans in {topic.name} can be read"
                 f"{self._first_error(topic)}; correct the laser's driver, or copy the bag again"
             )
-        sector_rad = None if topic.type in LASER_SCANS else cloud_sector_rad(first)
-        if sector_rad is not None:
-            raise SourceError(
-                f"{self._path}: each cloud of {topic.name} is a sector of about {degrees(sector_rad):.0f} deg; let the "
-                "driver publish whole turns, or record its laser scans"
-            )
         return recorded_laser(topic, first, frame)
 
     def _first_error(self, topic: Topic) -> str:
@@ -176,7 +169,9 @@ class _Planner:
             if fault is None or not (error or self._scans_change()):
                 return candidate
             self._notes.append(f"{self._path}: {candidate.name} {fault}, so it is not used")
-        self._notes.append(f"{self._path}: {WITHOUT_ODOMETRY}")
+        its = self._bag.census[self._topics.scans[0]]
+        interval_s = (its.span_ns[1] - its.span_ns[0]) / (max(1, its.count - 1) * NANOSECONDS)
+        self._notes.append(f"{self._path}: {without_odometry(interval_s)}")
         return None
 
     def _odometry_candidates(self, frame: str) -> Iterator[OdometryInput]:

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import chain, repeat
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,20 +32,19 @@ from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.path_summary import PathSummary
-from fcslam.sources.returns import RangeSample, placeholder_note, without
+from fcslam.sources.returns import RangeSample
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 _audit = partial(Audit, "message")
 _EACH_LASER = "give one for each laser, in the same order"
 
 _OF_SCANS = "its range_min and range_max"
-_OF_CLOUDS = "that its points are in metres, its mounting in tf and the heights of --sensors cloud-band"
+_OF_CLOUDS = "that a cloud is a whole turn, its points are in metres, its mounting in tf and the heights of cloud-band"
 
 
 class _Reading(NamedTuple):
     survey: Survey
     rig: Rig
-    placeholders: tuple[tuple[float, ...], ...]
     base_frame: str
 
 
@@ -106,8 +105,7 @@ class RosBag:
         """As in Source."""
         audit = self._audit = _audit()
         watch = ScanWatch(audit)
-        rig, placeholders = self._reading.rig, self._reading.placeholders
-        correction = self.options.correction
+        rig, correction = self._reading.rig, self.options.correction
         floors = [floor and floor.mirrored() if correction.upside_down else floor for floor in correction.floors]
         found, faults = self._fixes
         fixes = deque(found)
@@ -119,8 +117,6 @@ class RosBag:
                 record = rig.scan(entry)
                 while fixes and fixes[0].stamp <= record.stamp:
                     yield fixes.popleft()
-                if values := placeholders[entry.scan.laser]:
-                    record = replace(record, ranges_m=without(record.ranges_m, values))
                 if floors and (floor := floors[entry.scan.laser]) is not None:
                     record = floor.left_out(record)
                 watch.add(number, record)
@@ -172,14 +168,6 @@ class RosBag:
                 yield from reader.add(message.number, item)
         yield from reader.finish()
 
-    def _count_broken_transforms(self, audit: Audit, errors: dict[str, str]) -> None:
-        read = () if self.plan.odometry is None else self.plan.odometry.topics
-        for topic in self.plan.topics.transforms:
-            its = self.bag.census[topic]
-            if its.broken and topic not in read:
-                errors.setdefault(topic.name, f"message {its.first_broken} of it: {its.error}")
-                audit.add(Fault.BROKEN_MESSAGE, its.first_broken, its.broken)
-
     @cached_property
     def _reading(self) -> _Reading:
         audit, errors, plan = _audit(), dict[str, str](), self.plan
@@ -188,7 +176,11 @@ class RosBag:
         samples = [RangeSample() for _ in lasers]
         farthest_m = [laser.first.range_max_m for laser in lasers]
         base_frame = self.options.base_frame or ""
-        self._count_broken_transforms(audit, errors)
+        for topic in plan.topics.transforms:
+            census = self.bag.census[topic]
+            if census.broken and topic not in (plan.odometry.topics if plan.odometry else ()):
+                errors[topic.name] = f"message {census.first_broken} of it: {census.error}"
+                audit.add(Fault.BROKEN_MESSAGE, census.first_broken, census.broken)
         for _, entry in self._entries(audit, errors):
             if isinstance(entry, PosedScan):
                 laser = entry.scan.laser
@@ -204,7 +196,6 @@ class RosBag:
         which = [f" of {laser.name}" for laser in lasers]
         for sample, its, recorded in zip(samples, which, lasers, strict=True):
             sample.check(self.path, its, _OF_CLOUDS if recorded.is_level else _OF_SCANS)
-        placeholders = tuple(sample.placeholders() for sample in samples)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
         mountings = [_moved(mounted, self.options.correction) for mounted in self._mountings(base_frame, errors)]
         camera, camera_note = None, ""
@@ -220,7 +211,6 @@ class RosBag:
             ),
             *chain.from_iterable(laser.notes(self.path, self.options.cloud_band) for laser in lasers),
             *plan.scans.notes,
-            *chain.from_iterable(map(placeholder_note, repeat(self.path), placeholders, which)),
             *self.robot.notes,
             *plan.topics.notes,
             *plan.odometry_notes,
@@ -236,7 +226,7 @@ class RosBag:
         survey = Survey(
             scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), (*self._notes, *notes), camera
         )
-        return _Reading(survey, rig, placeholders, base_frame)
+        return _Reading(survey, rig, base_frame)
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary, errors: Mapping[str, str]) -> None:
         path, topics, (laser, *_) = self.path, self.plan.topics, self.plan.lasers

@@ -15,8 +15,6 @@ NARROWEST_RAD, WIDEST_RAD = 0.01 * tau, 0.75 * tau
 """Field of view of a sector."""
 WIDEST_HALF_RAD: Final = 3.0
 """Sectors of half a turn follow each other in either direction; they are taken to be counter-clockwise."""
-_SLOTS: Final = 36
-"""Parts of a turn in which clouds are compared."""
 LEAST_SHARE: Final = 1.0 / 3.0
 """Share of the scans that go on with a sector; it is a half for two sectors that leave a part of the turn out."""
 
@@ -24,19 +22,6 @@ LEAST_SHARE: Final = 1.0 / 3.0
 def are_sectors(scans: Sequence[ScanMessage]) -> bool:
     """Whether many of these successive scans go on where the one before them ends."""
     return sum(_follows(a, b) for a, b in pairwise(scans)) > LEAST_SHARE * len(scans)
-
-
-def cloud_sector_rad(clouds: Sequence[ScanMessage]) -> float | None:
-    """Field of view of successive point clouds if they are sectors of a turn; None if each is a whole one."""
-    seen = np.zeros((len(clouds), _SLOTS), np.bool_)
-    for k, cloud in enumerate(clouds):
-        measured = np.flatnonzero(np.isfinite(cloud.raw_ranges_m))
-        angles = cloud.beams.angle_min_rad + measured * cloud.beams.angle_increment_rad
-        seen[k, np.floor(angles / tau * _SLOTS).astype(np.int64) % _SLOTS] = True
-    at_once = [k for k, cloud in enumerate(clouds) if abs(cloud.stamp - clouds[0].stamp) < LONGEST_SWEEP_S / 2]
-    own, together = float(np.median(seen.sum(axis=1))), int(seen[at_once].any(axis=0).sum())
-    is_apart = together >= max(_SLOTS / 2, 1.5 * own) or together >= max(_SLOTS / 6, 5.0 * own)
-    return own / _SLOTS * tau if is_apart else None
 
 
 class SectorJoiner:

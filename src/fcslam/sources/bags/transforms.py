@@ -41,8 +41,9 @@ Link = tuple[str, str]
 """Names of the parent and the child of a transform."""
 USUAL_BASES = ("base_footprint", "base_link")
 """Frames of the robot's body, where no message names it."""
-_CORRECTED = ("map", "world", "earth", "utm", "camera_init")
-"""Frames in which a robot drives besides that of its odometry, and where it jumps; the last is of LOAM's successors."""
+_CORRECTED = ("map", "world", "earth", "utm", "global", "camera_init")
+"""Parts of the names of frames in which a robot drives besides that of its odometry, and where it jumps; the last is of
+LOAM's successors."""
 _NO_ODOMETRY = ("map", *USUAL_BASES)
 """Frames in which a robot jumps, or in which its joints move."""
 IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -192,7 +193,7 @@ def is_odom(frame: str) -> bool:
 
 def is_corrected(frame: str) -> bool:
     """Whether poses in a frame of this name are corrected, and jump."""
-    return last_part(frame) in _CORRECTED
+    return any(name in last_part(frame) for name in _CORRECTED) and not is_odom(frame)
 
 
 def is_fixed(frame: str) -> bool:

@@ -21,9 +21,9 @@ from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import FIRST_MESSAGES, ScanGate, check_consistency, scan_window
 from fcslam.sources.logs.carmen import BROKEN, SICK_MAX_RANGE_M, CarmenArrays
 from fcslam.sources.logs.laser import laser_model, usual_log_beams
-from fcslam.sources.path_summary import WITHOUT_ODOMETRY, PathSummary
+from fcslam.sources.path_summary import PathSummary, without_odometry
 from fcslam.sources.pose import UNKNOWN_POSE, pose_of
-from fcslam.sources.returns import RangeSample, placeholder_note, without
+from fcslam.sources.returns import RangeSample
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 _Entry = tuple[int, FloatArray]
@@ -35,7 +35,6 @@ class _Reading(NamedTuple):
     pose_from_odometry: bool
     """Whether scans take the pose of the latest odometry message, because their own never changes."""
     has_odometry: bool
-    placeholders: tuple[float, ...]
 
 
 class CarmenLog:
@@ -76,7 +75,6 @@ class CarmenLog:
                 audit.add(Fault.INVALID_RANGE, number, invalid)
             beams = log.beams_of(k, laser.beams)
             assert beams is not None  # as the gate says
-            ranges_m = without(ranges_m, reading.placeholders)
             scan = LaserScan(log.stamps[k], ranges_m, laser.with_beams(beams), T_odom_base)
             watch.add(number, scan)
             yield scan
@@ -116,17 +114,17 @@ class CarmenLog:
         # a line that states the angles says more
         telling = next((k for k in admitted if log.stated[k] is not None), admitted[0])
         laser = laser_model(log, telling, admitted)
-        notes = [f"the odometry {driven.fault}; it is not used", WITHOUT_ODOMETRY] if driven.fault else []
-        placeholders = sample.placeholders()
+        alone = without_odometry(duration_s / max(1, scan_count - 1))
+        notes = [f"the odometry {driven.fault}; it is not used", alone] if driven.fault else []
         survey = Survey(
             scan_count,
             duration_s,
             driven.length_m,
             (laser,),
             faults,
-            (*(f"{path}: {note}" for note in notes), *placeholder_note(path, placeholders, "")),
+            tuple(f"{path}: {note}" for note in notes),
         )
-        return _Reading(survey, pose_from_odometry, driven.fault is None, placeholders)
+        return _Reading(survey, pose_from_odometry, driven.fault is None)
 
     def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, _Entry]]:
         """Lines with consistent scans, and with the readings of the odometry among them."""
