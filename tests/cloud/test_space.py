@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -102,33 +103,23 @@ def test_a_robot_in_space_has_no_place_in_a_mission_in_the_plane():
         feed(cloud, sent("a"))
 
 
-def ply(data):
-    """Columns of a PLY file by name: read as its own header says, by none of our code."""
-    head, _, body = data.partition(b"end_header\n")
-    lines = head.decode().split("\n")
-    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
-    sizes = {"float": "<f4", "uchar": "u1"}
-    named = [(line.split()[2], sizes[line.split()[1]]) for line in lines if line.startswith("property")]
-    rows = np.frombuffer(body, np.dtype(named))
-    assert len(rows) == count
-    return rows
-
-
-def test_the_joint_map_is_a_ply_file_of_points_with_normals():
+def test_another_library_reads_the_joint_map_with_normals_and_colours(tmp_path):
     result = result_of(sent("a", "b"))
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
     run = run_of(result, tracks, [], "", OccupancyConfig(), with_local_maps=False, with_certificates=False)
-    rows = ply(run.map_files["map.ply"])
-    heights = rows["z"].astype(float)
-    floor = rows[np.abs(rows["nz"]) > 0.95]
-    low = np.median(floor["z"][floor["z"] < 0.0])
+    (tmp_path / "map.ply").write_bytes(run.map_files["map.ply"])
+    points, normals, colours = (rows[:, 0].astype(float) for rows in cv2.loadPointCloud(str(tmp_path / "map.ply")))
+    assert len(points) == len(normals) == len(colours) > 1000
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=0.01)
+    heights, upward = points[:, 2], normals[:, 2]
+    is_floor = np.abs(upward) > 0.95
+    low = np.median(heights[is_floor & (heights < 0.0)])
     assert low == pytest.approx(-BASE_M, abs=0.03), "the first base is the origin"
     assert heights.max() - low == pytest.approx(1.95, abs=0.15)
-    assert np.mean(floor["nz"][floor["z"] < low + 0.2] > 0.0) > 0.98, "the floor faces the scanner; feet of walls lean"
-    walls = rows[(heights > low + 0.5) & (heights < low + 1.5)]
-    assert np.median(np.abs(walls["nz"])) < 0.1
-    bright = rows["green"][np.argsort(heights)].astype(int)
+    faces_up = upward[is_floor & (heights < low + 0.2)] > 0.0
+    assert np.mean(faces_up) > 0.98, "the floor faces the scanner; feet of walls lean"
+    assert np.median(np.abs(upward[(heights > low + 0.5) & (heights < low + 1.5)])) < 0.1
+    bright = colours[np.argsort(heights), 1]
     assert bright[: len(bright) // 10].mean() < bright[-len(bright) // 10 :].mean()
 
 

@@ -136,6 +136,9 @@ class Tracker3d:
             is_fixed = bool(np.linalg.eigvalsh(fit.measured[:3, :3])[0] * 9.0 * predicted.sigma[0] ** 2 > 1.0)
             moved = se3.between(T_odom_begin, end) if is_fixed else None
             self.sensors.learn(predicted, motion, moved, length_s, sigma_rad)
+            since_s = begin_s + length_s - self._end_s
+            if 2.0 * length_s < since_s < np.inf:  # a turn that is much shorter than the time between turns
+                self.sensors.velocity = se3.log(se3.between(self._T_odom_end, end)) / since_s
         self._turns += 1
         self._T_odom_end, self._end_s = end, begin_s + length_s
         share = -first_s / length_s
