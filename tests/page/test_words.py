@@ -31,7 +31,8 @@ def test_the_state_of_a_robot_is_true(told):
         ["wait", "Maps, not joined with the others yet"],
         ["wait", "Maps, not on a map yet"],
         ["alert", "Silent for 2 min: switched off, or without network"],
-        ["past", "Switched off 2 h ago, on its map"],
+        ["past", "Not heard for 2 h, on its map"],
+        ["past", "Drive ended, on the shared map"],
         ["past", "Not heard since the service started; on its map"],
         ["past", "Removed by hand; the map is without it"],
         ["past", "Earlier drive, ended"],
@@ -42,6 +43,18 @@ def test_the_state_of_a_robot_is_true(told):
 
 def test_the_evidence_names_what_it_rests_on(told):
     assert told["sensors"] == ["laser scanner", "camera", "tag"]
+
+
+def test_metrics_and_plots_are_in_words(told):
+    assert told["names"] == [
+        "places seen by two robots, accepted", "words of the lidar vocabulary, detector birds-1", "sent by robot_1",
+        "map area",
+    ]  # fmt: skip
+    assert told["plots"] == [
+        ["Other drives confirm its pose", [0.5, 0.75], "75 %"],
+        ["Since its last message", [1, 2], "2 s"],
+        ["Messages a second", [0, 3], "3"],
+    ]
 
 
 def test_attention_has_what_needs_a_person_and_is_empty_otherwise(told):

@@ -33,6 +33,8 @@ class FakeCloud:
     """Detectors that it announces all the time, and their contents; one without cannot be had."""
     removed: bool = False
     """Whether the session is removed."""
+    has_ended: bool = False
+    """Whether the robot said that it ends."""
     fetched: list[str] = field(default_factory=list)
 
     def detector(self, channel, version):
@@ -43,6 +45,9 @@ class FakeCloud:
         if content is None:
             raise CloudError("there is none")
         return content
+
+    def end(self):
+        self.has_ended = True
 
     def state(self):
         epochs = {epoch for epoch, _ in (*self.stored, *self.refused)}
@@ -105,6 +110,9 @@ class Network:
         if fault in ("none", "twice"):
             return self.cloud.send(packets, correction)
         raise UnavailableError("no answer")
+
+    def end(self):
+        self.cloud.end()
 
     def detector(self, channel, version):
         return self.cloud.detector(channel, version)

@@ -260,6 +260,20 @@ def test_another_mission_is_found_out_though_the_cloud_takes_nothing(robot):
         robot.step()
 
 
+def test_a_robot_that_has_sent_everything_says_that_it_ends(tmp_path):
+    cloud, stopped = FakeCloud(), threading.Event()
+    robot = Robot(tmp_path / "outbox", Network(cloud))
+    stopped.set()
+    robot.outbox.put([said(0), said(1)])
+    robot.sender.run(stopped)
+    assert not cloud.has_ended, "packets wait"
+    while robot.outbox.waiting.packets:
+        robot.step()
+    robot.sender.run(stopped)
+    assert cloud.has_ended
+    robot.outbox.close()
+
+
 def test_a_cloud_that_turns_the_robot_away_ends_the_sender(robot):
     def turned_away():
         raise CloudError("no token")

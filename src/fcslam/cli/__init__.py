@@ -186,12 +186,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return READER_GONE
         return _fail(f"standard output cannot be written ({error.strerror}); make room", BAD_INPUT)
     except click.ClickException as error:
-        error.show()
-        return error.exit_code
+        return _show(error)
     except (click.Abort, KeyboardInterrupt):
         code = INTERRUPTED
     # typer itself turns Ctrl-C into this code
     return _fail("interrupted", code) if code == INTERRUPTED else int(code)
+
+
+def _show(error: click.ClickException) -> int:
+    if isinstance(error, click.exceptions.NoArgsIsHelpError) or not isinstance(error, click.UsageError):
+        error.show()
+        return error.exit_code
+    how = f" (`{error.ctx.command_path} -h` shows what there is)" if error.ctx else ""
+    return _fail(f"{error.format_message().rstrip('.')}{how}", error.exit_code)
 
 
 def _fail(message: str, code: int) -> int:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from fcslam.robot.frontend import RobotConfig
 
-FIRST_SCANS_S, EVERYTHING_S = 15, 45
+FIRST_SCANS_S, EVERYTHING_S = 15, 60
 """About what compiling takes on one core of a laptop: what first scans need, and everything."""
 
 

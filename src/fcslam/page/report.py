@@ -77,6 +77,10 @@ class ShownRun:
         """None: no robot sends anything here."""
         return None
 
+    def has_ended(self, robot: str) -> bool:  # noqa: ARG002
+        """None does here."""
+        return False
+
     def packet_counts(self) -> PacketCounts:
         """All packets of a finished run took effect."""
         count = self._packets.total()

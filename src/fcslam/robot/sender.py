@@ -82,6 +82,9 @@ class Sender:
         try:
             while not stop.is_set():
                 stop.wait(self.step())
+            if self.trouble is None and not self._outbox.waiting.packets:
+                with suppress(CloudError):
+                    self._transport.end()
         except Exception as error:  # the thread that waits for this one raises it
             self.failure = error
 

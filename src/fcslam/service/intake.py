@@ -22,6 +22,8 @@ from fcslam.wire.packets import SizedPacket, decode, encode, read_number, unpack
 
 AGENT_LEASE_S = 30.0
 """How long after its last request an agent keeps its robot to itself."""
+ENDED = "ended"
+"""Stands for the agent of a robot that ended; agents are hexadecimal."""
 MOST_WAITING = 20_000
 """Packets of one robot, in all its sessions, that may wait: for their effect, or for a packet before them."""
 MOST_REFUSED_BYTES = 64 * 2**20
@@ -93,7 +95,7 @@ class Agents:
         now = self._clock()
         with self._lock:
             holder, heard = self._held.get(robot, (agent, now))
-            if holder != agent and now < heard + AGENT_LEASE_S:
+            if holder not in (agent, ENDED) and now < heard + AGENT_LEASE_S:
                 raise held_by_another(robot, heard + AGENT_LEASE_S - now)
             self._held[robot] = agent, now
 
@@ -101,6 +103,15 @@ class Agents:
         """Note that the agent of a robot sent something."""
         with self._lock:
             self._held[robot] = agent, self._clock()
+
+    def end(self, robot: str) -> None:
+        """Note that a robot ended: any agent may speak for it now."""
+        with self._lock:
+            self._held[robot] = ENDED, self._clock()
+
+    def has_ended(self, robot: str) -> bool:
+        """Whether the robot said so, and nothing since."""
+        return self._held.get(robot, ("", 0.0))[0] == ENDED
 
     def silent_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch; None: never."""
@@ -187,6 +198,14 @@ class Intake:
     def last_heard_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch; None: never since the service started."""
         return self._agents.silent_s(robot)
+
+    def end(self, robot: str) -> None:
+        """Note that a robot ended, and has sent everything."""
+        self._agents.end(robot)
+
+    def has_ended(self, robot: str) -> bool:
+        """Whether a robot ended, and has sent everything."""
+        return self._agents.has_ended(robot)
 
     def sessions(self, robot: str | None = None) -> list[SessionState]:
         """Sessions of one robot or of all, by robot and epoch."""

@@ -80,6 +80,10 @@ class OpenMission:
         """Seconds since the robot's last batch; None: never since the service started."""
         return self.intake.last_heard_s(robot)
 
+    def has_ended(self, robot: str) -> bool:
+        """Whether the robot said that it ends, and nothing since."""
+        return self.intake.has_ended(robot)
+
     def packet_counts(self) -> PacketCounts:
         """How far the packets of all robots are."""
         self.intake.follow()

@@ -57,6 +57,9 @@ class ViewedMission(Protocol):
     def last_heard_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch; None: never."""
 
+    def has_ended(self, robot: str) -> bool:
+        """Whether the robot said that it ends, and nothing since."""
+
     def packet_counts(self) -> PacketCounts:
         """How far the packets of all robots are."""
 

@@ -451,7 +451,7 @@ class Worker:
     def _certifies(self) -> bool:
         """Whether the live map is to be drawn with a new certificate. A map with news is first drawn without."""
         is_old = self._clock() >= self._certify_at and self._certified_packets < self._applied
-        return is_old and (self._live.shown == self._applied or self._certify_at < self._clock() - QUALITY_EVERY_S)
+        return is_old and (self._live.shown == self._applied or self._certify_at < self._clock() - LONGEST_WAIT_S)
 
     def _live_writer(self) -> Callable[[], None]:
         result, traffic = self._host.fleet.estimate(), self._store.traffic()

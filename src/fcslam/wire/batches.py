@@ -12,6 +12,8 @@ CORRECTION_HEADER = "Fcslam-Correction"
 """Version of the newest correction that the robot has; absent: none."""
 AGENT_HEADER = "Fcslam-Agent"
 """128 random bits in hexadecimal that distinguish two agents of the same name."""
+ENDED_HEADER = "Fcslam-Ended"
+"""1: the robot ends, and has sent everything."""
 
 REMOVED_HEADER = "Fcslam-Removed"
 """Header of a response: 1 if an administrator removed the robot's session, and its packets have no effect; else 0."""

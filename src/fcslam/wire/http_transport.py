@@ -14,6 +14,7 @@ from fcslam.records import Channel, StrPath
 from fcslam.wire.batches import (
     AGENT_HEADER,
     CORRECTION_HEADER,
+    ENDED_HEADER,
     MEDIA_TYPE,
     REFUSED_HEADER,
     REMOVED_HEADER,
@@ -198,8 +199,8 @@ class HttpClient:
 
     def _reason(self, response: "httpx.Response") -> str:
         said = _detail(response).get("error") or response.reason_phrase
-        remedy = "; give a valid token in --credentials" if response.status_code == 401 else ""
-        return f"{self._url}: {said} ({response.status_code}){remedy}"
+        remedy = {401: "; give a valid token in --credentials", 404: "; no such thing on this server: is it fcslam's?"}
+        return f"{self._url}: {said} ({response.status_code}){remedy.get(response.status_code, '')}"
 
 
 class HttpTransport(HttpClient):
@@ -251,6 +252,11 @@ class HttpTransport(HttpClient):
                 )
             except (PacketError, ValueError) as error:
                 raise UnavailableError(f"{self._url}: the reply is broken ({error})") from error
+
+    def end(self) -> None:
+        """Tell the cloud that this robot ends and has sent everything; raises as ``state``."""
+        path, headers = f"robots/{self._robot}/packets", {ENDED_HEADER: "1"}
+        self._ask("POST", path, content=write_batch(()), headers=headers)
 
     def detector(self, channel: Channel, version: str) -> bytes:
         """Download the file of an announced detector; raises as ``state``."""

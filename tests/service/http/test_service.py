@@ -306,6 +306,15 @@ def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):
     assert edit(mapped, "removal", {"robot": "b"}, "eye").status_code == 403
 
 
+def test_a_robot_that_ended_is_not_silent_until_it_sends_again(mapped):
+    ended = lambda: {robot["robot"]: robot["ended"] for robot in get(mapped, "robots").json()}  # noqa: E731
+    assert ended() == {"a": False, "b": False}
+    mapped.send("b", [], **{"Fcslam-Ended": "1"})
+    assert ended() == {"a": False, "b": True}
+    mapped.told(mapped.send("b", [], **{"Fcslam-Agent": "another"}))  # need not wait for the first one's time
+    assert ended() == {"a": False, "b": False}
+
+
 def test_a_robot_is_told_that_it_is_removed(mapped):
     assert mapped.send("b", []).headers["Fcslam-Removed"] == "0"
     edit(mapped, "removal", {"robot": "b", "epoch": 0})

@@ -1,12 +1,15 @@
 // The state of the mission, as the service gave it last.
 
+import { distance } from "./geometry.js";
 import { Outdated, ask, at, json, report, unlessSame } from "./service.js";
 
 const MOST_CLOSURES = 5000; // that the page asks for
+const MOST_SAMPLES = 300; // looks at a robot that the page remembers, five minutes
 
 export const fleet = {
   counts: null, mission: null, robots: [], maps: [], verdicts: [], edits: [], regions: [], accepted: [],
-  trails: new Map(), until: Infinity, // the moment that the map shows: paths and evidence until then
+  trails: new Map(), since: new Map(), samples: new Map(), // by session; live poses after the path, and what the plots show
+  until: Infinity, // the moment that the map shows: paths and evidence until then
   selected: null, scan: null, readOnly: false, mayEdit: false, readAt: 0,
 };
 let release = null, placedNow = null; // the closures that were placed last
@@ -60,10 +63,22 @@ export async function update(forget) {
   const seen = robots.filter((r) => r.map !== null), paths = await Promise.all(seen.map((r) => trail(r.session)));
   const isPlaced = closed === placedNow && seen.length === fleet.trails.size && seen.every((r, i) => paths[i] === fleet.trails.get(r.session) && r.map === robotNamed(r.session)?.map);
   Object.assign(fleet, { counts, mission: counts.mission, maps, verdicts, robots, edits, readOnly: counts.read_only, mayEdit: counts.may_edit, readAt: Date.now() });
+  fleet.since = new Map(seen.map((r, i) => [r.session, after(paths[i].at(-1), fleet.since.get(r.session) ?? [])]));
   fleet.trails = new Map(seen.map((r, i) => [r.session, paths[i]]));
   if (!isPlaced) fleet.accepted = closed.map(placed);
   placedNow = closed;
   fleet.regions = edits.filter((e) => e.kind === "region" && !e.undone_by).map((e) => e.content);
+}
+
+// Live poses that a path does not have yet: those after its end. A straight line to the robot would cross walls.
+function after(end, poses) {
+  const off = poses.map((pose) => distance(end.slice(1), pose)), nearest = off.indexOf(Math.min(...off));
+  return poses.slice(nearest + 1).slice(-MOST_SAMPLES);
+}
+// What each look at a robot found; the plots of its card show it.
+function sample({ session, packets, quality, last_heard_s }) {
+  const all = fleet.samples.get(session) ?? [], last = all.at(-1);
+  fleet.samples.set(session, [...all, { packets, sent: last ? packets - last.packets : 0, quality, silent: last_heard_s ?? 0 }].slice(-MOST_SAMPLES));
 }
 
 // Poses and times are newer than the map: the service knows them from the packets.
@@ -72,7 +87,9 @@ export async function look() {
   for (const robot of fleet.robots) {
     const now = known.get(robot.session);
     if (now?.map === robot.map) Object.assign(robot, { T_map_base: now.T_map_base, z_m: now.z_m });
-    robot.last_heard_s = now?.last_heard_s ?? null;
+    if (now?.map === robot.map && now.T_map_base) fleet.since.get(robot.session)?.push(now.T_map_base);
+    Object.assign(robot, { last_heard_s: now?.last_heard_s ?? null, ended: now?.ended ?? false });
+    if (now) sample(now);
   }
   fleet.counts = counts; fleet.readAt = Date.now();
   const robot = robotNamed(fleet.selected);

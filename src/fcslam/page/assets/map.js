@@ -7,6 +7,7 @@ import { Failed, Refused, ask, at, json, report } from "./service.js";
 
 const WORLD_M = 512, TILE_PX = 512, MOST_TILES = 48, RETRY_MS = 2000;
 const BAR_PX = 120; // longest scale bar
+const NEAR_M = 1.5; // a path ends so near its robot, or there is a gap: nobody knows the way between
 const CLICK_PX = 8; // a click this near a line or a robot selects it
 const RECENT_S = 120; // the path of the last minutes is drawn in full, the rest faint
 const DARKEST_WALL = 150, UNKNOWN = 205, FREE = 254; // grey values of tiles
@@ -253,9 +254,11 @@ function drawRobot(robot) {
   if (isShown("paths")) {
     strokeWay(path, colour, 1.5, isChosen ? 0.9 : 0.4);
     strokeWay(recent, colour, isChosen ? 4 : 3);
-    if (isNow && distance(last.slice(1), pose) > 0.05) outline([last.slice(1), pose], { colour, width: 3, closed: false });
+    const since = fleet.since.get(robot.session) ?? [];
+    if (isNow && since.length) outline(distance(last.slice(1), since[0]) < NEAR_M ? [last.slice(1), ...since] : since, { colour, width: 3, closed: false });
   }
   if (isEarlierDrive(robot)) return; // an earlier drive has a path and no robot
+  if (robot.ended) { dot(pose, colour, isChosen ? 7 : 5); if (isShown("names")) nameRobot(robot.robot, onScreen(pose)); return; }
   if (isNow && fleet.scan?.session === robot.session && isShown("scan")) {
     pen.fillStyle = colour;
     for (const point of fleet.scan.points) { const [x, y] = onScreen(movedPoint(pose, point)); pen.fillRect(x - 1.5, y - 1.5, 3, 3); }
@@ -269,7 +272,7 @@ function drawRobot(robot) {
   pen.restore();
   if (isShown("names")) nameRobot(isInSpace() ? `${robot.robot}, z ${heightText((isNow ? robot.z_m : null) ?? last[4])}` : robot.robot, [px, py]);
 }
-const isEarlierDrive = (robot) => fleet.robots.some((r) => r.robot === robot.robot && r.epoch > robot.epoch && r.map === robot.map);
+const isEarlierDrive = (robot) => fleet.robots.some((r) => r.robot === robot.robot && r.epoch > robot.epoch);
 
 function drawGrid() {
   const step = barMetres(), w = size.w, h = size.h, corners = [[0, 0], [w, 0], [0, h], [w, h]].map(onMap);
@@ -282,7 +285,7 @@ function drawGrid() {
 
 // What the service knows of a map besides its cells: shapes, which are read when their layer is switched on.
 const LOOKS = { // colour, width of the line, filling
-  quality: { good: ["free", 0.5, 0.3], bad: ["keepout", 0.5, 0.4] },
+  quality: { good: ["free", 0.5, 0.15], bad: ["keepout", 0.5, 0.4] },
   plan: { plan: ["plan", 1.5, 0], missing: ["disappeared", 6, 0], new: ["appeared", 6, 0], moved: ["area", 6, 0] },
   changes: { appeared: ["appeared", 3, 1], disappeared: ["disappeared", 3, 1] },
   tags: { tag: ["camera", 2, 0.4] },

@@ -16,7 +16,7 @@ const TURN_RAD = Math.PI / 36;
 // Another mission was opened: the page forgets what it knows of the one before.
 function forget() {
   stop();
-  Object.assign(fleet, { selected: null, scan: null, until: Infinity, trails: new Map() });
+  Object.assign(fleet, { selected: null, scan: null, until: Infinity, trails: new Map(), since: new Map(), samples: new Map() });
   Object.assign(chart, { opened: null, view: null, moved: false, followed: false, closure: null, beside: null });
   at("moment").value = at("moment").max;
   at("closure").hidden = true;
@@ -46,7 +46,7 @@ async function read() {
   if (!chart.moved) fit();
   showAll();
   await refreshEvidence();
-  if (at("learning").open) await showLearning();
+  if (at("learning").hidden || at("learning").open) await showLearning();
   redraw();
 }
 // One update at a time, and another one after it if something happened meanwhile: no answer overtakes a later one.

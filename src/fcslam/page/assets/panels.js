@@ -6,7 +6,7 @@ import { heightText } from "./heights.js";
 import { chart, choose, fit, goTo, openMap, redraw, showLayers } from "./map.js";
 import { ask, at, json, link, report } from "./service.js";
 import { change, tell } from "./tools.js";
-import { attention, count, dayOf, decisionOf, duration, editOf, history, lackOf, listed, metres, moment, sensorOf, stateOf, verdictOf } from "./words.js";
+import { attention, count, dayOf, decisionOf, duration, editOf, history, lackOf, listed, metres, moment, nameOf, plotsOf, sensorOf, stateOf, verdictOf } from "./words.js";
 
 const LISTED = 200; // rows of the table of evidence
 const NEAR_M = 5; // pairs with both ends so near each other show the same place
@@ -97,12 +97,23 @@ export function showAge() {
 
 const cards = new Map();
 function cardOf(name) {
-  const card = element("li"), state = element("p", "", { className: "state" }), more = element("details"), facts = element("p"), earlier = element("ul");
+  const card = element("li"), state = element("p", "", { className: "state" }), more = element("details"), facts = element("p"), earlier = element("ul"), plots = element("dl", "", { className: "plots" });
   const choice = button("", () => { const isNew = fleet.selected !== name; if (isNew) showRobot(name); else select(name); }, { className: "name" });
-  more.append(element("summary", "Details"), facts, earlier);
+  more.append(element("summary", "Details"), facts, plots, earlier);
   card.append(choice, state, more);
-  cards.set(name, { card, choice, state, facts, earlier });
+  cards.set(name, { card, choice, state, facts, plots, earlier });
   return cards.get(name);
+}
+// The last minutes of a robot, since the page is open: a line for each measure, with its newest value.
+function showPlots(list, samples) {
+  if (samples.length < 2 || !list.parentElement.open) return;
+  list.replaceChildren(...plotsOf(samples).flatMap(({ name, values, newest }) => {
+    const line = Object.assign(document.createElement("canvas"), { width: 240, height: 32, role: "img", ariaLabel: `${name}: ${newest}` }), pen = line.getContext("2d"), most = Math.max(...values, 1e-9);
+    pen.strokeStyle = getComputedStyle(list).getPropertyValue("--accent"); pen.lineWidth = 1.5;
+    values.forEach((value, k) => pen.lineTo((k / (values.length - 1)) * 240, 30 - (28 * value) / most));
+    pen.stroke();
+    return [element("dt", `${name}: ${newest}`), element("dd", line)];
+  }));
 }
 export function forgetCards() { cards.clear(); }
 
@@ -131,14 +142,15 @@ function showPlaces(map, places) {
 export function showFleet() {
   const newest = fleet.robots.filter((r) => !fleet.robots.some((o) => o.robot === r.robot && o.epoch > r.epoch)), list = at("robots");
   const shown = newest.map((robot) => {
-    const { card, choice, state, facts, earlier } = cards.get(robot.session) ?? cardOf(robot.session), { kind, text } = stateOf(robot, fleet.robots, fleet.readOnly);
+    const { card, choice, state, facts, plots, earlier } = cards.get(robot.session) ?? cardOf(robot.session), { kind, text } = stateOf(robot, fleet.robots, fleet.readOnly);
     fill(choice, [robot.robot, robot.color], () => [swatch(robot.color), robot.robot]);
     choice.ariaPressed = String(robot.session === fleet.selected);
     card.dataset.kind = kind;
     state.textContent = text;
     const heard = fleet.readOnly || robot.last_heard_s === null ? [] : [`heard ${duration(robot.last_heard_s)} ago`], sent = fleet.counts.metrics[`uplink_bytes_${robot.robot}`];
     const parts = [`drove ${metres(robot.path_length_m)}`, `${count(robot.keyscans, "scan")} on the map`, ...(robot.z_m === null ? [] : [`height ${heightText(robot.z_m)}`]), ...(robot.floor ? [`floor ${robot.floor}`] : []), ...(sent ? [`${(sent / 1000).toLocaleString("en", { maximumFractionDigits: 0 })} kB sent`] : []), ...heard];
-    facts.textContent = `${parts.join("; ")}. ${Object.entries(robot.detectors).map(([channel, made]) => `Detector (${channel}): ${made}.`).join(" ")}`;
+    facts.textContent = `${parts.join("; ")}. ${Object.entries(robot.detectors).filter(([channel]) => Object.keys(fleet.counts.metrics).some((name) => name.startsWith(`words_${channel}_`))).map(([channel, made]) => `Detector (${channel}): ${made}.`).join(" ")}`;
+    showPlots(plots, fleet.samples.get(robot.session) ?? []);
     const before = fleet.robots.filter((r) => r.robot === robot.robot && r.epoch < robot.epoch);
     fill(earlier, before.map((r) => [r.session, r.path_length_m]), () => before.map((r) => element("li", `Drive ${r.epoch + 1}, ${r.first_s === null ? "not on the map" : `from ${moment(r.first_s, firstStamp(), true)}`}: ${metres(r.path_length_m)}`)));
     return card;
@@ -294,12 +306,13 @@ export function showEdits() {
 export async function showFacts() {
   const [metrics, config] = await Promise.all([json("metrics.json"), ask("config.yaml").then((a) => a.text())]);
   at("config").textContent = config;
-  at("metrics").replaceChildren(...metrics.map(({ name, value, unit }) => row(name.replaceAll("_", " "), value === null ? "–" : Number(value.toPrecision(4)).toLocaleString("en", { maximumFractionDigits: 6 }), unit === "1" ? "" : unit)));
+  at("metrics").replaceChildren(...metrics.map(({ name, value, unit }) => row(nameOf(name), value === null ? "–" : Number(value.toPrecision(4)).toLocaleString("en", { maximumFractionDigits: 6 }), unit === "1" ? "" : unit)));
 }
 // The rounds of a federated training, newest first.
 export async function showLearning() {
   const rounds = await json("learning").catch(() => []), names = [...new Set(rounds.flatMap((r) => [...Object.keys(r.losses), ...Object.keys(r.measures)]))];
-  at("learned").textContent = rounds.length ? `${count(rounds.length, "round")}, ${rounds.filter((r) => r.released).length} released` : "The robots do not learn: fcslam serve --learn";
+  at("learning").hidden = !rounds.length;
+  at("learned").textContent = `${count(rounds.length, "round")}, ${rounds.filter((r) => r.released).length} released`;
   at("of-rounds").replaceChildren(...["Round", "Robots", "Left out", ...names.map((name) => name.replaceAll("_", " "))].map((title) => element("th", title, { scope: "col" })));
   at("rounds").replaceChildren(...rounds.toReversed().map((r) => row(`${r.round}${r.released ? ", released" : ""}`, r.robots.join(", "), [r.reason, r.left_out].filter(Boolean).join("; "), ...names.map((name) => (r.losses[name] ?? r.measures[name])?.toFixed(3) ?? "–"))));
 }

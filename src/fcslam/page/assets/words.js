@@ -41,10 +41,27 @@ export function stateOf(robot, robots, readOnly) {
   if (isEarlier(robot, robots)) return say("past", "Earlier drive, ended");
   const place = robot.map === null ? "not on a map yet" : !hasOthers(robot, robots) ? "on its map" : isAlone(robot, robots) ? "not joined with the others yet" : "on the shared map";
   if (readOnly) return say(place === "not joined with the others yet" || robot.map === null ? "wait" : "ok", `Finished, ${place}`);
+  if (robot.ended) return say("past", `Drive ended, ${place}`);
   if (robot.last_heard_s === null) return say("past", `Not heard since the service started; ${place}`);
-  if (robot.last_heard_s >= GONE_S) return say("past", `Switched off ${duration(robot.last_heard_s)} ago, ${place}`);
+  if (robot.last_heard_s >= GONE_S) return say("past", `Not heard for ${duration(robot.last_heard_s)}, ${place}`);
   if (robot.last_heard_s >= HEARD_S) return say("alert", `Silent for ${duration(robot.last_heard_s)}: switched off, or without network`);
   return say(place === "on its map" || place === "on the shared map" ? "ok" : "wait", `Maps, ${place}`);
+}
+
+// What the plots of a robot show, and the newest value of each in words.
+export function plotsOf(samples) {
+  const measure = (name, key, say) => { const values = samples.map((one) => one[key]); return { name, values, newest: say(values.at(-1)) }; };
+  return [measure("Other drives confirm its pose", "quality", (value) => `${Math.round(100 * value)} %`), measure("Since its last message", "silent", duration), measure("Messages a second", "sent", String)];
+}
+
+// Names of metrics in words.
+const NAMES = [
+  [/^inter_robot_closures_(\w+)$/, "places seen by two robots, $1"], [/^intra_robot_closures_(\w+)$/, "places seen again by one robot, $1"], [/^words_(\w+?)_(.+)$/, "words of the $1 vocabulary, detector $2"],
+  [/^uplink_bytes_(.+)$/, "sent by $1"], [/^uplink_rate_(.+)$/, "rate of $1"], [/^downlink_bytes_(.+)$/, "sent to $1"], [/^downlink_rate_(.+)$/, "rate to $1"], [/^turns$/, "messages in the map"], [/^keyscans$/, "scans in the map"], [/^map_error_95$/, "error of the map, 95 % of it"],
+];
+export function nameOf(metric) {
+  const [pattern, words] = NAMES.find(([one]) => one.test(metric)) ?? [];
+  return pattern ? metric.replace(pattern, words) : metric.replaceAll("_", " ");
 }
 
 // What the drawn map lacks; empty if it is current.

@@ -195,6 +195,7 @@ def _sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
                 removed=is_removed(name, changes),
                 detectors=dict(hello.detector_versions) if hello else {},
                 last_heard_s=heard_s,
+                ended=mission.has_ended(robot),
             )
         )
     return sessions

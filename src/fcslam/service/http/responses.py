@@ -93,6 +93,7 @@ class SessionSummary(StrictModel):
     removed: bool = Field(description="whether an administrator removed it, so that its packets have no effect")
     detectors: dict[Channel, str] = Field(description="version by channel, as its newest hello names them")
     last_heard_s: float | None = Field(description="seconds since the robot's last batch")
+    ended: bool = Field(description="whether the robot said that it ends and has sent everything")
 
 
 class RobotSummary(StrictModel):

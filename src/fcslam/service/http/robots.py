@@ -21,6 +21,7 @@ from fcslam.service.http.state import ServiceState
 from fcslam.wire.batches import (
     AGENT_HEADER,
     CORRECTION_HEADER,
+    ENDED_HEADER,
     MEDIA_TYPE,
     REFUSED_HEADER,
     REMOVED_HEADER,
@@ -61,11 +62,14 @@ def robot_router(state: ServiceState) -> APIRouter:
         robot: Name,
         agent: Annotated[str, Header(alias=AGENT_HEADER, max_length=64)] = "",
         correction: Annotated[int, Header(alias=CORRECTION_HEADER, ge=-1)] = -1,
+        ended: Annotated[bool, Header(alias=ENDED_HEADER)] = False,
     ) -> Response:
         """Store a batch of packets; the response acknowledges what is on disk."""
         body = await read_body(request, MAXIMUM_BATCH_BYTES)
         mission = state.mission
         reply, refused, removed = await run_in_threadpool(mission.intake.take, robot, agent, body, correction)
+        if ended:
+            mission.intake.end(robot)
         mission.worker.notify()
         state.measures.answer(robot, reply)
         headers = {REFUSED_HEADER: str(refused), REMOVED_HEADER: str(int(removed))}
