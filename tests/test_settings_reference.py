@@ -26,7 +26,7 @@ def key_paths(content, path=""):
 def test_every_key_of_the_configuration_has_a_row_with_its_default():
     mission = settings_reference.cloud_page() + settings_reference.robot_page() + settings_reference.lidar_page()
     for path in key_paths(yaml.safe_load(dump(MissionConfig()))):
-        assert mission.count(f"| `{path}` |") == 1
+        assert mission.count(f"\n| `{path}` |") == 1
     assert "| `map.resolution_m` | `0.05` m | >= 0.001, <= 10 |" in mission
     assert "| `fleet.fusion` | `joint` | `joint`, `two_point` |" in mission
     page = settings_reference.training_page()

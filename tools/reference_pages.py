@@ -88,11 +88,21 @@ def shared_rows(text: str) -> list[str]:
 
 
 def refer(text: str, shared: list[str]) -> str:
-    """A section in which shared rows lead to the table of all commands."""
-    for line in shared:
-        head = line.removesuffix(" |").rpartition(" | ")[0]
-        text = text.replace(line, f"{head} | [shared](#options-of-several-commands) |")
-    return text
+    """A section in which shared rows are one line that leads to the table of all commands."""
+    lines = text.split("\n")
+    found = [line for line in lines if line in shared]
+    if not found:
+        return text
+    names = [re.search(r"--[\w-]+", line.partition(" | ")[0]) for line in found]
+    listed = ", ".join(f"`{name[0]}`" for name in names if name)
+    also = f"Also {listed}: [options of several commands](#options-of-several-commands)."
+    kept = [line for line in lines if line not in shared]
+    end = max(k for k, line in enumerate(kept) if line.startswith("| ")) + 1
+    if kept[end - 1] == ROWS[0]:  # no row is left
+        end -= 1
+        del kept[end : end + 2]
+        return "\n".join([*kept[:end], also, *kept[end:]])
+    return "\n".join([*kept[:end], "", also, *kept[end:]])
 
 
 def sections(group: click.Group, context: click.Context) -> Iterator[str]:
@@ -170,7 +180,7 @@ def rest_page() -> str:
 
 
 def numbers_of(described: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Answer, field and meaning of all numbers that viewers get, as OpenAPI describes them."""
+    """Answer, field and meaning of all numbers with a unit or a range that viewers get, as OpenAPI describes them."""
     schemas = described["components"]["schemas"]
     shown = [
         path["get"] for path in described["paths"].values() if path.get("get", {}).get("tags") in (["fleet"], ["maps"])
@@ -178,8 +188,9 @@ def numbers_of(described: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     answers = re.findall(r"schemas/(\w+)", json.dumps([operation["responses"]["200"] for operation in shown]))
     for name in sorted(set(answers)):
         for field, schema in schemas[name]["properties"].items():
-            if re.search(r'"type": "(number|integer)"', json.dumps(schema)):
-                yield name, field, schema.get("description", "")
+            meaning = schema.get("description", "")
+            if re.search(r'"type": "(number|integer)"', json.dumps(schema)) and not meaning.startswith("number of"):
+                yield name, field, meaning
 
 
 def roles_of(routes: Iterable[Any]) -> Iterator[tuple[tuple[str, str], str]]:

@@ -1,4 +1,4 @@
-"""Write docs/reference/settings*.md, the reference of all settings, from the settings themselves.
+"""Write docs/reference/settings.md, the reference of all settings, from the settings themselves.
 
     make docs
 
@@ -51,8 +51,27 @@ NO_UNIT = "-"
 HEAD = """\
 # Settings
 
-fcslam works with its defaults; change a setting only for a special robot or building. `make docs` writes the pages from
-the code.
+fcslam works with its defaults. `make docs` writes the page from the code.
+
+## When to change one
+
+| when | key |
+|---|---|
+| robots are much larger or smaller than 0.7 m | `map.robot_radius_m` |
+| the map needs finer or coarser cells, or a huge hall needs more of them | `map.resolution_m`, `map.maximum_cells` |
+| beams reach beyond 30 m, or far returns are wrong | `map.usable_range_m` |
+| the scanner sees the robot itself (`fcslam info` says so) | `robot.lidar.ignore`, `robot.lidar.footprint` |
+| a text log or a program has scans of a scanner that spins | `robot.lidar.scan_duration_s` |
+| each robot is to keep a map of its own | `fleet.join_maps` |
+| you know where robots start | `fleet.starts`, `fleet.start_sigma` |
+| many days in one building need too much memory | `fleet.matcher.most_sessions_nearby`, `fleet.matcher.most_places` |
+| a robot is often carried, or often thinks so | `robot.lost.doubted` |
+| tags hang in the building | `robot.tags.family`, `robot.tags.size_m` |
+| a robot has no camera, or is to send no camera places | `robot.channels` |
+| tokens are shared with robots that you trust less | `fleet.claims` |
+| you repeat the paper | `--config paper` |
+
+Leave the others: the [results](../results/index.md) were measured with their defaults.
 
 ## How to set them
 
@@ -83,30 +102,23 @@ Units are SI; angles are in radians. A setting without unit is a count, a ratio 
 CLOUD = """\
 ## Cloud and map
 
-Commands that map or serve read these keys with `--config`. [Robots](settings-robot.md), their
-[LiDAR SLAM](settings-lidar.md) and [training](settings-training.md) have pages of their own. The service keeps {cloud}
-with each mission, so that it can rebuild the mission from its packets.
+Commands that map or serve read these keys with `--config`. The service keeps {cloud} with each mission, so that it can
+rebuild the mission from its packets.
 """
 
 ROBOT = """\
-# Settings of the robots
+## Robots
 
-These settings apply on each robot. Commands that map or run a robot read them with `--config`.
-[Settings](settings.md) shows how.
+Commands that map or run a robot read these keys with `--config`.
 """
 
 LIDAR = """\
-# Settings of LiDAR SLAM
+## LiDAR SLAM on each robot
 
-With these settings, each robot tracks its scans and closes its own loops. Commands that map or run a robot read them
-with `--config`. [Settings](settings.md) shows how.
+Commands that map or run a robot read these keys with `--config`.
 """
 
 TRAINING = """\
-# Settings of training
-
-Training on one machine and on several robots has configuration files of its own.
-
 ## Training
 
 `fcslam tools train --config` reads these keys from a YAML file.
@@ -140,12 +152,12 @@ def cloud_page() -> str:
 
 def robot_page() -> str:
     """The settings of the robots, without those of LiDAR SLAM."""
-    return "\n".join([ROBOT, *tables(MissionConfig().robot, "robot.", documented=(LidarConfig,), heading="##")])
+    return "\n".join([ROBOT, *tables(MissionConfig().robot, "robot.", documented=(LidarConfig,))])
 
 
 def lidar_page() -> str:
     """The settings of LiDAR SLAM on a robot."""
-    return "\n".join([LIDAR, *tables(MissionConfig().robot.lidar, "robot.lidar.", heading="##")])
+    return "\n".join([LIDAR, *tables(MissionConfig().robot.lidar, "robot.lidar.")])
 
 
 def training_page() -> str:
@@ -169,16 +181,11 @@ def training_page() -> str:
 
 
 PAGES: dict[Path, Callable[[], str]] = {
-    FOLDER / "settings.md": cloud_page,
-    FOLDER / "settings-robot.md": robot_page,
-    FOLDER / "settings-lidar.md": lidar_page,
-    FOLDER / "settings-training.md": training_page,
+    FOLDER / "settings.md": lambda: "\n".join([cloud_page(), robot_page(), lidar_page(), training_page()]),
 }
 
 
-def tables(
-    settings: Settings, path: str = "", documented: tuple[type[Settings], ...] = (), heading: str = "###"
-) -> Iterator[str]:
+def tables(settings: Settings, path: str = "", documented: tuple[type[Settings], ...] = ()) -> Iterator[str]:
     """The class, one table of the plain keys of ``settings``, and after it those of the settings nested in it."""
     rows, nested = [], []
     for key, field in type(settings).model_fields.items():
@@ -191,8 +198,8 @@ def tables(
         yield f"In the code: {place_of(type(settings))}.\n"
         yield "\n".join(["| key | default | allowed | effect |", "|---|---|---|---|", *rows, ""])
     for key, field, value in nested:
-        yield f"{heading} `{path}{key}`\n\n{sentence(field.description)}\n"
-        yield from tables(value, f"{path}{key}.", documented, heading)
+        yield f"### `{path}{key}`\n\n{sentence(field.description)}\n"
+        yield from tables(value, f"{path}{key}.", documented)
 
 
 def place_of(kind: type) -> str:
