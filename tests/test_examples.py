@@ -3,11 +3,14 @@
 import contextlib
 import importlib.util
 import io
+import json
 import os
 import re
 import runpy
 import subprocess
 import sys
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import cv2
@@ -104,6 +107,40 @@ def test_a_source_of_ones_own_is_mapped(tmp_path):
     height, width = map(int, re.search(r"\((\d+), (\d+)\)", start("own_source.py", "run", cwd=tmp_path)).groups())
     assert width * 0.05 == pytest.approx(8.0, abs=1.0)
     assert height * 0.05 == pytest.approx(6.0, abs=1.0)
+
+
+def test_a_webhook_hears_once_of_a_silent_robot(tmp_path, monkeypatch):
+    robot = {"ended": False, "removed": False}
+    robots = [
+        {**robot, "robot": "a", "last_heard_s": 90.0},
+        {**robot, "robot": "b", "last_heard_s": 90.0, "ended": True},
+    ]
+    answers, told = {"/api/v1/fleet": {"lacking_s": 0.1}, "/api/v1/robots": robots}, []
+
+    class Service(BaseHTTPRequestHandler):
+        def do_GET(self, content=None):
+            body = json.dumps(answers[self.path] if content is None else content).encode()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def do_POST(self):
+            told.append(
+                (self.headers["Authorization"], json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            )
+            self.do_GET("heard")
+
+    monkeypatch.setenv("WEBHOOK_TOKEN", "secret")
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    with ThreadingHTTPServer(("127.0.0.1", 0), Service) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}"
+        start("webhook.py", url, f"{url}/hook", 3, cwd=tmp_path)
+        server.shutdown()
+    ((token, content),) = told
+    assert token == "Bearer secret"
+    assert content == {"cause": "a", "text": "a has been silent for 90 s", "service": url}
 
 
 @pytest.mark.slow
