@@ -84,10 +84,13 @@ class CloudFolder:
 
     @cached_property
     def _reader(self) -> tuple[CloudReader, tuple[str, ...]]:
-        step = max(1, len(self._files) // FIRST_MESSAGES)
-        first = [self._cloud(number) for number in range(0, len(self._files), step)[:FIRST_MESSAGES]]
+        first = [self._cloud(number) for number in range(len(self._files))[:FIRST_MESSAGES]]
         mounting = CloudMounting(np.eye(3), np.zeros(3), 0.0, is_height_known=False)
-        return reader_of(first, mounting, CloudBand(), str(self.path))
+        reader, notes = reader_of(first, mounting, CloudBand(), str(self.path))
+        if reader.is_timed:
+            return reader, notes
+        order = "their order gives them" if reader.period_s else "the motion in a turn is not corrected: drive slowly"
+        return reader, (f"{self.path}: the points have no times; {order}", *notes)
 
     def _cloud(self, number: int) -> PointCloud:
         return read_cloud(self._files[number], self._stamps[number])

@@ -26,6 +26,8 @@ BAND_LASER: Final = LaserModel(DIRECTIONS // 2, -np.pi, 2.0 * tau / DIRECTIONS, 
 _FEWEST_POINTS: Final = 50
 _ONE_RING_RAD: Final = 0.02
 """Largest spread of the elevations of the points of one ring."""
+_FASTEST_RAD_S: Final = 40.0 * tau
+"""No LiDAR turns faster."""
 _FLOOR_M, _FLOOR_SHARE = 0.15, 0.05
 """Points this near to a plane are on it; least share of the points that are on a floor."""
 _BELOW_SHARE, _OPENINGS = 0.1, 10.0
@@ -84,15 +86,17 @@ def reader_of(
     stamps = np.array([cloud.stamp for cloud in first])
     period_s = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     is_timed = any(len(cloud.times_s) for cloud in first)
-    if not is_timed:
-        turns = [
-            turn_of((cloud.points @ mounting.rotation.T)[:, :2], np.linspace(0.0, 1.0, len(cloud.points)))
-            for cloud in first
-        ]
-        if sum(turn is not None for turn in turns) * 2 <= len(turns):
-            period_s = 0.0
-        order = "their order gives them" if period_s else "the motion during a turn is not corrected, so drive slowly"
-        notes.append(f"{where}: the points have no times; {order}")
+    xy = [(cloud.points @ mounting.rotation.T)[:, :2] for cloud in first]
+    is_in_order = 2 * len(_turns(xy, [np.linspace(0.0, 1.0, len(each)) for each in xy])) > len(xy)
+    if is_timed and is_in_order:
+        rates = _turns(xy, [cloud.times_s for cloud in first])
+        is_timed = 2 * len(rates) > len(xy) and float(np.median(np.abs(rates))) < _FASTEST_RAD_S
+        if not is_timed:
+            notes.append(
+                f"{where}: the times of the points contradict how the LiDAR turns; their order gives them: correct the "
+                "unit of the times in the driver"
+            )
+    period_s = period_s if is_in_order else 0.0
     if not mounting.is_height_known:
         mounting = _on_floor(first, mounting) or mounting._replace(is_height_known=True)
     flipped = mounting._replace(rotation=np.diag([1.0, -1.0, -1.0]) @ mounting.rotation)
@@ -110,6 +114,12 @@ def reader_of(
             "LiDAR is mounted; check its pose in tf"
         )
     return CloudReader(mounting, is_timed, period_s, band.body_radius_m), tuple(notes)
+
+
+def _turns(xy: Sequence[FloatArray], times_s: Sequence[NDArray[np.float64]]) -> list[float]:
+    """Rates, in rad/s, of the clouds in which the LiDAR turns by these times."""
+    turns = (turn_of(points, times) for points, times in zip(xy, times_s, strict=True) if len(points) == len(times))
+    return [turn[1] for turn in turns if turn is not None]
 
 
 def _elevations(cloud: PointCloud) -> float:
