@@ -93,6 +93,8 @@ def map_recordings(
     options = in_3d(bag_options, settings)
     opened = _opened(recordings, options, settings.robot.lidar, at_least=1 if onto is None else 0)
     robots = split_recordings(opened, split)
+    if settings.fleet.dimensions == 3 and (note := sources.planar_note(opened)):
+        _log.info("%s", note)
     if isinstance(floors, str):
         floors = {robot.name: floors for robot in robots if floors}
     inputs = MissionInputs(earlier, tuple(vetoes), floors, anchors)

@@ -6,10 +6,14 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.errors import CloudError
 from fcslam.live.fleet_view import FleetView
+from fcslam.maps.joint_voxels import read_points
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.keys import Credentials
+from fcslam.wire.packets import encode
+from tests.cloud.space_fleet import sent
 from tests.service.http.desk import SCRIPT, A, B, Desk
 
 
@@ -98,6 +102,27 @@ def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service
             before = first.received_bytes
             follow(first)
             assert first.received_bytes - before < 1000, "nothing changed, so no tile travels"
+
+
+def test_points_of_a_map_in_space_come_once_somebody_asks_for_them(tmp_path):
+    now = [0.0]
+    packets = [encode(packet) for packet in sent("a", "B") if packet.robot == "a"]
+    with Desk(tmp_path / "data", config=CloudConfig(fleet=FleetConfig(dimensions=3))) as desk:
+        with closing(FleetView(client(desk, "a"), "a", lambda: None, clock=lambda: now[0])) as fleet:
+            fleet.step()
+            assert fleet.points() is None
+            fleet.step()
+            assert fleet.points() is None, "it is in no map yet"
+            desk.send("a", packets)
+            now[0] += 1000.0
+            fleet.step()
+            points, before = fleet.points(), fleet.received_bytes
+            now[0] += 1000.0
+            fleet.step()
+            assert fleet.received_bytes - before < 2000, "nothing changed, so no point travels"
+        (written, _) = read_points((desk.state.mission.run_folder / "map.ply").read_bytes(), "map.ply")
+        assert np.array_equal(points, written)
+        assert desk.ask("GET", "/api/v1/robots/b/points", "b").status_code == 404
 
 
 def test_a_new_frame_shows_no_map_before_all_its_tiles_came(desk):

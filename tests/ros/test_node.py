@@ -9,7 +9,8 @@ import pytest
 
 import fcslam
 from fcslam.errors import InputError
-from fcslam.geometry import se2
+from fcslam.geometry import se2, se3
+from fcslam.geometry.groups import compose
 from fcslam.live.records import Wiring
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, parse_map
 from fcslam.ros.node import EMPTY, FINISH, INITIAL_POSE, SAVE_MAP, STRING, RobotNode, await_sensors
@@ -17,13 +18,16 @@ from fcslam.ros.outputs import POSE
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.sensors import STEPS_BACK_FOR_RESTART
 from fcslam.sources import BagOptions
-from fcslam.sources.bags.codec import ODOMETRY, SCAN, TRANSFORMS
+from fcslam.sources.bags.codec import ODOMETRY, POINT_CLOUD, SCAN, TRANSFORMS
 from fcslam.sources.bags.transforms import in_space
 from fcslam.wire.fleet_replies import FrontierReply, MapFrontiers, QualityReply, TeammatePose
 from tests import small_fleet
 from tests.live.same_thread import SameThread
 from tests.ros.memory_network import MemoryNetwork, offered
 from tests.ros.ros_messages import CODEC, odometry, scan, transform
+from tests.sources.clouds import VELODYNE, Measured, cloud
+from tests.spinning_lidar import circle, room
+from tests.spinning_lidar import drive as drive_lidar
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.slow
@@ -74,7 +78,12 @@ def test_every_scan_gets_a_pose_and_the_map_is_published(network, robot, scans):
     plays(network, scans)
     run_until(node, len(scans))
     node.publish_map()
-    assert [pose.header.stamp.sec for pose in network.sent["/robot1/pose"]] == [int(s.stamp) for s in scans]
+    poses = network.sent["/robot1/pose"]
+    assert [pose.header.stamp.sec for pose in poses] == [int(s.stamp) for s in scans]
+    covariance = poses[-1].pose.covariance.reshape(6, 6)
+    assert covariance[np.ix_((0, 1, 5), (0, 1, 5))] == pytest.approx(robot.pose.covariance)
+    assert np.flatnonzero(np.diag(covariance)).tolist() == [0, 1, 5]
+    assert poses[-1].pose.pose.orientation.z == pytest.approx(np.sin(robot.pose.theta / 2.0))
     (grid,) = network.sent["/robot1/map"]
     expected = robot.map()
     assert (grid.info.height, grid.info.width) == expected.cells.shape
@@ -92,6 +101,51 @@ def test_map_to_odom_carries_the_frame_of_the_odometry(network, robot, scans):
     assert {(t.header.frame_id, t.child_frame_id) for t in sent} <= {("map", "robot1/odom")}
     stamps = [t.header.stamp.sec * 10**9 + t.header.stamp.nanosec for t in sent]
     assert stamps == sorted(set(stamps))
+
+
+def test_a_robot_in_space_publishes_six_degrees_of_freedom_and_points_for_who_asks(tmp_path):
+    kinds = {"/points": POINT_CLOUD, "/odom": ODOMETRY, "/tf_static": TRANSFORMS}
+    network, options = MemoryNetwork([offered(topic, kind) for topic, kind in kinds.items()]), BagOptions(in_3d=True)
+    topics = await_sensors(network, "", options, 0.0, 0.0)
+    space = {"fleet": {"dimensions": 3}}
+    turns = list(drive_lidar(room(1), circle((6.0, 4.0), 1.6, 0.8), 80, azimuths=120))
+    with fcslam.Robot("anna", lidar_3d=True, config=space, wiring=Wiring(SameThread())) as robot:
+        node = RobotNode(network, "", topics, options, robot, NodeParameters(), lambda _: None)
+        network.say("/tf_static", TRANSFORMS, transform(0.0, "base_link", "lidar", (0.1, 0.0, 0.0), height_m=0.6))
+        for turn, _ in turns:
+            points = Measured(turn.points_m - turn.origin_m.astype(np.float32), turn.times_s)
+            network.say("/points", POINT_CLOUD, cloud(turn.stamp, points, VELODYNE))
+            for stamp, *pose in turn.wheels:
+                network.say("/odom", ODOMETRY, odometry(stamp, pose))
+        run_until(node, len(turns) - 2)
+        robot.finish()
+        node.publish_map()
+        assert network.sent["/cloud_map"] == [], "nobody has asked for points"
+        network.others.append(offered("/cloud_map", POINT_CLOUD)._replace(publishes=False))
+        node.publish_map()
+        node.publish_map()
+        run = robot.save(tmp_path / "run")
+        newest = robot.pose
+    found = np.array([pose_in(message.pose.pose) for message in network.sent["/pose"]])
+    truth = np.array([pose for _, pose in turns[1 : 1 + len(found)]])
+    off = se3.log(se3.between(se3.between(truth[0], truth), se3.between(found[0], found)))
+    assert np.abs(off[:, :3]).max() < 0.05
+    assert np.diag(network.sent["/pose"][-1].pose.covariance.reshape(6, 6)) == pytest.approx(
+        np.diag(newest.covariance_6d)
+    )
+    assert np.abs(se3.between(newest.T_map_base_6d, compose(newest.T_map_odom_6d, newest.T_odom_base))[:6]).max() < 1e-9
+    (points,) = network.sent["/cloud_map"]
+    heights = points.data.view("<f4").reshape(-1, 3)[:, 2]
+    assert np.ptp(heights) == pytest.approx(3.0, abs=0.2)
+    assert {"map.ply", "map.pgm"} <= run.map_files.keys()
+    assert set(network.sent["/map"][-1].data) == {-1, 0, 100}
+    assert len(network.sent["/path"][-1].poses) > 10
+
+
+def pose_in(pose):
+    """A pose of ROS, shape (7,)."""
+    at, turn = pose.position, pose.orientation
+    return np.array((at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w))
 
 
 def test_the_finish_topic_ends_the_drive(network, robot):

@@ -39,13 +39,6 @@ def test_a_map_is_sent_again_if_it_changed(network, published):
     assert published.map(3, occupancy(cells, origin=(-1.0, 0.0)))
 
 
-def test_covariance_is_that_of_x_y_and_yaw(network, published):
-    published.pose(5 * SECOND, np.array((1.0, 2.0, np.pi / 2)), np.diag((0.1, 0.2, 0.3)))
-    (pose,) = network.sent["/robot1/pose"]
-    assert np.diag(pose.pose.covariance.reshape(6, 6)).tolist() == [0.1, 0.2, 0, 0, 0, 0.3]
-    assert pose.pose.pose.orientation.z == pytest.approx(np.sin(np.pi / 4))
-
-
 def test_closures_and_diagnostics(network, published):
     published.closures(1, np.array([[[0.0, 0.0], [1.0, 2.0]]]))
     (markers,) = network.sent["/robot1/closures"]

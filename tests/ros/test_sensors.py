@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from fcslam.errors import SourceError
 from fcslam.records import CameraImage, GnssFix
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.ros.live_plan import PATIENCE_S, SCANS_FOR_RIG
@@ -44,7 +45,8 @@ class Robot:
     ):
         self.said = []
         self.kinds = kinds
-        topics = SensorTopics(kinds, scans, odometry, ("/tf", "/tf_static"), camera, info, fixes, (), imu)
+        in_space = options.get("in_3d", False)
+        topics = SensorTopics(kinds, scans, odometry, ("/tf", "/tf_static"), camera, info, fixes, (), imu, in_space)
         self.sensors = LiveSensors(topics, "", BagOptions(**options), self.hears_of)
         self.records = []
         self.now_s = 0.0
@@ -294,6 +296,48 @@ def test_point_clouds_wait_for_tf_and_then_are_scans(columns, directions):
     errors = np.abs(record.ranges_m - plan_ranges(*LASER_POSE[:2], angles))
     assert np.nanmedian(errors) < 0.005
     assert np.isfinite(errors).mean() > 0.9
+
+
+@pytest.mark.parametrize("wheels", [True, False])
+def test_clouds_that_are_read_whole_come_with_the_readings_until_their_end(wheels):
+    kinds = {**KINDS, "/points": POINT_CLOUD, "/imu": IMU}
+    options = {} if wheels else {"odom_topic": "none"}
+    robot = Robot("/odom" if wheels else None, kinds, scans=("/points",), imu="/imu", in_3d=True, **options)
+    robot.hears("/tf_static", transform(0.0, "base_link", "lidar", LASER_POSE, height_m=0.4))
+    measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rotation(yaw=LASER_POSE[2]), columns=180)
+
+    def drives(stamps):
+        for stamp in stamps:
+            robot.hears("/points", CODEC.encode(cloud(stamp, measured, VELODYNE), POINT_CLOUD))
+            for later in stamp + np.arange(0.02, 0.11, 0.02):
+                robot.hears("/imu", imu(later, 0.1))
+                if wheels:
+                    robot.hears("/odom", odometry(later, (later, 0.0, 0.0)))
+
+    drives(9.0 + 0.1 * np.arange(12))
+    assert robot.stamps == pytest.approx(9.1 + 0.1 * np.arange(11))  # the first shows how long a turn takes
+    record = robot.records[-1]
+    heights = record.points_m[:, 2]
+    assert np.median(heights[heights < 0.2]) == pytest.approx(0.0, abs=0.01)
+    assert record.times_s.max() == pytest.approx(PERIOD_S, rel=0.02)
+    assert record.origin_m == pytest.approx((*LASER_POSE[:2], 0.4))
+    assert record.imu[:, 0] == pytest.approx(record.stamp + np.arange(0.02, 0.11, 0.02))
+    assert record.imu[:, [3, 6]] == pytest.approx(np.tile((0.1, 9.81), (5, 1)))
+    at_stamp = (record.stamp + 0.02, 0.0, 0.0) if wheels else np.full(3, np.nan)
+    assert record.T_odom_base == pytest.approx(at_stamp, abs=1e-6, nan_ok=True)
+    drives(0.1 * np.arange(5))
+    assert robot.sensors.restarts == 1
+    assert robot.stamps[-1] == pytest.approx(0.4)
+
+
+def test_a_lidar_with_one_ring_is_refused_in_3d():
+    robot = Robot(kinds={**KINDS, "/points": POINT_CLOUD}, scans=("/points",), in_3d=True)
+    robot.hears("/tf_static", transform(0.0, "base_link", "lidar", LASER_POSE, height_m=0.4))
+    measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rings=1)
+    for stamp in 0.1 * np.arange(1, 2 + SCANS_FOR_RIG):
+        robot.hears("/points", CODEC.encode(cloud(stamp, measured, VELODYNE), POINT_CLOUD))
+    with pytest.raises(SourceError, match="/points has one ring, so it is a 2D laser; map it without --3d"):
+        robot.hears("/odom", odometry(1.0, (0.0, 0.0, 0.0)))
 
 
 def test_depth_images_wait_for_their_calibration():

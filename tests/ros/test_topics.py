@@ -10,6 +10,7 @@ from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
+    IMU,
     MULTI_ECHO_SCAN,
     ODOMETRY,
     POINT_CLOUD,
@@ -46,6 +47,16 @@ def test_laser_scans_go_before_point_clouds_and_these_before_depth_images():
     assert (found.scans, found.camera) == (("/depth/image",), None)
     assert found.kinds["/depth/camera_info"] == CAMERA_INFO
     assert choose(cloud, laser, namespace="", scan_topics=("points",)).scans == ("/points",)
+
+
+def test_in_3d_clouds_go_first_and_the_imu_is_read_beside_wheels():
+    topics = ("/z", POINT_CLOUD), ("/points", POINT_CLOUD), ("/scan", SCAN), ("/odom", ODOMETRY), ("/imu", IMU)
+    found = choose(*topics, namespace="", in_3d=True)
+    assert (found.scans, found.odometry, found.imu, found.in_space) == (("/points",), "/odom", "/imu", True)
+    assert choose(*topics, namespace="", in_3d=True, scan_topics=("/z",)).scans == ("/z",)
+    laser = choose(*topics, namespace="", in_3d=True, scan_topics=("/scan",))
+    assert (laser.scans, laser.imu, laser.in_space) == (("/scan",), None, False)
+    assert choose(*topics[2:], namespace="", in_3d=True).scans == ("/scan",)
 
 
 def test_tf_of_the_namespace_goes_before_that_of_all_robots():

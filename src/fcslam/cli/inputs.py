@@ -67,14 +67,14 @@ def open_recording(
     argument: str, sensors: list[str] | None, console: "Console", in_3d: bool = False
 ) -> "tuple[Source, Survey]":
     """Open the recording of an argument ``LOG`` or ``NAME=LOG``, and print what was chosen in it."""
-    from fcslam.sources import BagOptions, open_source, whole_clouds
+    from fcslam.sources import BagOptions, open_source, planar_note, whole_clouds
 
     path, name = named_path(argument)
     options = bag_options(sensors)
     options = replace(options or BagOptions(), in_3d=True) if in_3d else options
     source = whole_clouds(open_source(path, options, name), options)
     survey = source.survey()
-    print_notes(console, survey.notes)
+    print_notes(console, [*survey.notes, *filter(None, [planar_note([source]) if in_3d else ""])])
     return source, survey
 
 

@@ -5,7 +5,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -65,6 +65,7 @@ def drive_live(
     from fcslam.ros.addresses import open_network
     from fcslam.ros.node import RobotNode, await_sensors
     from fcslam.runs import prepare_output
+    from fcslam.sources import IN_PLANE
 
     output = new_folder(RUNS) if output is None else output
     prepare_output(output, force=False)
@@ -79,13 +80,18 @@ def drive_live(
 
     with (
         closing(open_network(live.address)) as network,
-        compiled(console),
-        start(live.name, on_event=print_event) as robot,
+        ExitStack() as stack,
     ):
         namespace = live.address.namespace
         topics = await_sensors(network, namespace, live.options, live.parameters.topic_timeout)
         for note in topics.notes:
             notify(note)
+        if live.options.in_3d and not topics.in_space:
+            notify(IN_PLANE.format(live.name))
+        stack.enter_context(compiled(console, topics.in_space))
+        of_lidar = {"lidar_3d": True} if topics.in_space else {}
+        robot = start(live.name, on_event=print_event, **of_lidar)
+        stack.enter_context(closing(robot))
         suggest_pose = robot.suggest_pose if isinstance(robot, LocalizedRobot) else None
         change_floor = None if isinstance(robot, LocalizedRobot) else robot.change_floor
         node = RobotNode(

@@ -18,6 +18,7 @@ from fcslam.cli.options import (
     RosParameters,
     Sensors,
     ServerUrl,
+    Space,
     UseSimTime,
     access,
     mission_config,
@@ -46,6 +47,7 @@ def robot(
     output: Annotated[Path | None, output_option("Run folder, with the robot's own map.", RUNS)] = None,
     floor: Floor = "",
     config: ConfigFiles = None,
+    in_space: Space = False,
     sensors: Sensors = None,
     ros_parameters: RosParameters = None,
     use_sim_time: UseSimTime = False,
@@ -53,6 +55,7 @@ def robot(
     quiet: Quiet = False,
 ) -> None:
     """Map a live robot, alone or with the fleet of a cloud service."""
+    from fcslam.api import in_3d
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
     from fcslam.storage.files import keep_private
@@ -63,10 +66,11 @@ def robot(
             f"{address}: is not the address of a live robot, such as ros2:/robot1; `fcslam play` plays a recording to "
             "a service"
         )
+    settings, cloud = mission_config(config, in_space=in_space), access(server, credentials, budget_kBps)
     live = live_source(address, sensors, ros_parameters, use_sim_time)
-    settings, cloud = mission_config(config), access(server, credentials, budget_kBps)
+    live = live._replace(options=in_3d(live.options, settings) or live.options)
     plan = learning_plan(settings.robot, cloud, credentials, state) if learn else None
-    with copied_process(settings.robot) as worker:
+    with copied_process(None if settings.fleet.dimensions == 3 else settings.robot) as worker:
         wiring = Wiring(worker, keeps_keyframes=learn)
         start = partial(Robot, server=cloud, state=state, config=settings, floor=floor, wiring=wiring)
         drive_live(live, start, output, notices(quiet), plan)

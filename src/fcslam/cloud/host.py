@@ -12,10 +12,11 @@ from fcslam.cloud.report import fuse_members
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import PacketError
-from fcslam.geometry import se2
-from fcslam.geometry.groups import group_of
+from fcslam.geometry import se2, se3
+from fcslam.geometry.groups import group_of, to_space
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.maps.fusion import fuse
+from fcslam.maps.joint_voxels import joint_voxels
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import ClosureStatus, Edit, FloatArray, frozen
 from fcslam.storage.snapshot import from_state, to_state
@@ -90,6 +91,12 @@ class FleetHost:
         ]
         grid = self._settings.map
         return fuse_members(members, grid) if members else fuse((), np.empty((0, 3)), {}, grid)
+
+    def points(self, session: str, T_other_map: FloatArray) -> FloatArray:
+        """A point for each voxel of the map that a session is in, in another frame, shape (N, 3)."""
+        paths = [mapped.space for mapped in _in_map_of(session, self.fleet.estimate()).values()]
+        placed = [(voxels, path.T_map_base[voxels.id.number]) for path in paths if path for voxels in path.voxel_maps]
+        return se3.transform(to_space(T_other_map), joint_voxels(placed)[0]) if placed else np.empty((0, 3))
 
     def closures(self, session: str, T_other_map: FloatArray) -> FloatArray:
         """Both ends of each accepted closure in the map of a session, shape (N, 2, 2), metres in another frame."""

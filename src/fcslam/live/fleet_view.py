@@ -13,6 +13,7 @@ import numpy as np
 
 from fcslam.errors import FcslamError, UnavailableError
 from fcslam.maps.joint_tiles import LARGEST_ANSWER, TiledMap, decode_batch
+from fcslam.maps.joint_voxels import read_points
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray
 from fcslam.robot.sender import ASK_AFTER_S, retry_delay_s
@@ -65,6 +66,8 @@ class FleetView:
         self.quality: tuple[QualityReply, ...] = ()
         """How good the robot's map is; empty before the cloud has computed its certificate."""
         self._advised_s = -np.inf
+        self._points: FloatArray | None = None
+        self._points_etag, self._points_due_s = "", np.inf
         self.trouble: str | None = None
         """Why the cloud cannot be followed; None if it can."""
         self._failures = 0
@@ -93,6 +96,14 @@ class FleetView:
         """Index of the map that the robot is in, as the cloud draws it; None if it is in none."""
         reply = () if self._reply is None else self._reply[0].robots
         return next((one.map_index for one in reply if one.robot == self._robot), None)
+
+    def points(self) -> FloatArray | None:
+        """The newest points of the joint map in space, shape (N, 3), in ``map``; None before the first came.
+
+        They are large, so they come from the first call on, as often as the limit of the tiles allows.
+        """
+        self._points_due_s = min(self._points_due_s, self.clock())
+        return self._points
 
     def teammates(self, map_index: int | None) -> FloatArray:
         """The other robots in a map: x and y there, metres, and the age of the pose, seconds; shape (N, 3)."""
@@ -136,6 +147,17 @@ class FleetView:
         if self.clock() - self._advised_s >= ASK_AFTER_S:
             self._advised_s = self.clock()
             self.frontiers, self.quality = client.frontiers(self._robot), client.quality(self._robot)
+        if self.clock() >= self._points_due_s:
+            self._ask_for_points()
+
+    def _ask_for_points(self) -> None:
+        before = self._client.received_bytes
+        self._points_due_s = self.clock() + ASK_AFTER_S
+        found = self._client.points(self._robot, self._points_etag)
+        if found is not None:
+            self._points, _ = read_points(found[0], "the joint map")
+            self._points_etag = found[1]
+            self._points_due_s += POLL_S * (self._client.received_bytes - before) / self._limit_bytes
 
     def _run(self) -> None:
         wait_s = 0.0

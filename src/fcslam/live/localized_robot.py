@@ -152,6 +152,9 @@ class LocalizedRobot(LiveTracker):
         """As ``map``."""
         return self._map
 
+    def points(self) -> None:
+        """None: the robot makes no map in space."""
+
     def closures(self) -> FloatArray:
         """Both ends of each loop closure, shape (0, 2, 2): the robot makes no map."""
         return np.empty((0, 2, 2))

@@ -72,6 +72,10 @@ class OwnMap:
         """``T_own_base`` of the session's keyscans so far, shape (K, 3), metres and radians."""
         return self._answer(_call_host, FleetHost.poses, session)
 
+    def points(self, session: str, T_map_own: FloatArray) -> FloatArray:
+        """A point for each voxel of the map that a session is in, shape (N, 3); ``T_map_own`` as in ``draw``."""
+        return self._answer(_call_host, FleetHost.points, session, T_map_own)
+
     def closures(self, session: str, T_map_own: FloatArray) -> FloatArray:
         """Both ends of each accepted closure in the map that a session is in, shape (N, 2, 2), metres in ``map``."""
         return self._answer(_call_host, FleetHost.closures, session, T_map_own)

@@ -52,6 +52,11 @@ class RobotPose:
     """The pose with six degrees of freedom, (x, y, z, qx, qy, qz, qw), shape (7,); None in a map in 2D."""
 
     @property
+    def pose(self) -> FloatArray:
+        """The pose with all degrees of freedom that the map has, shape (3,) or (7,)."""
+        return self.T_map_base if self.T_map_base_6d is None else self.T_map_base_6d
+
+    @property
     def x(self) -> float:
         """Metres."""
         return float(self.T_map_base[0])

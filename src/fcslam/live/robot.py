@@ -255,6 +255,20 @@ class Robot(LiveTracker):
             session = self._session
         return own.draw(session_name(self.name, session), self._map_poses.T_map_own(session))
 
+    def points(self) -> FloatArray | None:
+        """The map in space that the robot is in: a point for each voxel, shape (N, 3), metres in ``map``.
+
+        With a server it is the joint map, which takes time to come. None: the map is in the plane, or not there yet.
+        """
+        if self._config.fleet.group is SE2:
+            return None
+        if self.fleet is not None:
+            return self.fleet.points()
+        self._catch_up()
+        with self._lock:
+            session = self._session
+        return self._require_own_map().points(session_name(self.name, session), self._map_poses.T_map_own(session))
+
     def closures(self) -> FloatArray:
         """Both ends of each loop closure that holds in the robot's map, shape (N, 2, 2), metres in ``map``."""
         own = self._require_own_map()

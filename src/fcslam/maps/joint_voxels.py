@@ -40,8 +40,14 @@ end_header
 def joint_points(maps: Sequence[tuple[VoxelMap, FloatArray]]) -> tuple[FloatArray, FloatArray]:
     """Points (N, 3) and normals (N, 3) of voxel maps, given with ``T_map_base`` (7,) of their keyscans.
 
-    Each voxel of the joint map has the middle of its points. Normals face the scanner.
+    Normals face the scanner.
     """
+    middles, scanner = joint_voxels(maps)
+    return middles, _normals(middles, scanner)
+
+
+def joint_voxels(maps: Sequence[tuple[VoxelMap, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    """The middle of the points of each voxel (N, 3), and where a scanner saw it from (N, 3); maps as before."""
     T_map_ground = [se3.compose(pose, voxels.T_base_ground) for voxels, pose in maps]
     placed = list(zip(T_map_ground, (voxels for voxels, _ in maps), strict=True))
     points = np.concatenate([se3.transform(T, voxels.points_m) for T, voxels in placed])
@@ -52,7 +58,7 @@ def joint_points(maps: Sequence[tuple[VoxelMap, FloatArray]]) -> tuple[FloatArra
     middles = np.column_stack([np.bincount(number, axis) for axis in points.T]) / counts[:, None]
     scanner = np.zeros_like(middles)
     scanner[number] = origins
-    return middles, _normals(middles, scanner)
+    return middles, scanner
 
 
 def _normals(points: FloatArray, scanner: FloatArray) -> FloatArray:

@@ -17,12 +17,12 @@ import numpy as np
 from fcslam.config import one_line
 from fcslam.errors import FcslamError, InputError
 from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
-from fcslam.records import NAME, FloatArray, LaserScan, SensorRecord
+from fcslam.records import NAME, CloudScan, FloatArray, LaserScan, SensorRecord
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock, TransformStream
 from fcslam.ros.inbox import POLL_S, SILENCE_S, Inbox
 from fcslam.ros.live_plan import Notify
 from fcslam.ros.network import Endpoint, Quality, RosNetwork
-from fcslam.ros.outputs import MAP, OWN_MAP, POSE, Outputs, nanoseconds
+from fcslam.ros.outputs import MAP, OWN_MAP, POINTS, POSE, Outputs, nanoseconds
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.sensors import LiveSensors
 from fcslam.ros.topics import SensorTopics, choose_sensor_topics, resolved
@@ -100,6 +100,8 @@ class RobotNode:
         self._stop = threading.Event()
         self._told: set[str] = set()
         self.scans = 0
+        self._points: FloatArray | None = None
+        """Of the map in space, as they were published last."""
         self._pose: RobotPose | None = None
         self._state: tuple[bool, float] | None = None
         """Whether the robot knows its pose in the map, and since which stamp."""
@@ -113,6 +115,8 @@ class RobotNode:
         self._transforms = TransformStream(
             nanoseconds(parameters.transform_bound), nanoseconds(parameters.transform_timeout)
         )
+        if topics.in_space:
+            self._outputs.offer_points()
         self.sensors = LiveSensors(topics, namespace, options, self._tell_once)
         self._restarts = 0
         self._subscribe()
@@ -170,6 +174,7 @@ class RobotNode:
         if self._pose is None and not is_finished_map:
             return
         stamp_ns = self._clock.now_ns() if self._pose is None else nanoseconds(self._pose.stamp)
+        self._publish_points(stamp_ns)
         own = self._robot.own_map()
         joint = None if self._robot.fleet is None or self._pose is None else self._robot.joint_map()
         is_new = self._outputs.map(stamp_ns, own if joint is None else joint)
@@ -177,8 +182,19 @@ class RobotNode:
             is_new |= self._outputs.map(stamp_ns, own, OWN_MAP)
         if is_new or is_finished_map:
             trajectory = self._robot.trajectory()
-            self._outputs.path(stamp_ns, trajectory.stamps, trajectory.T_map_base)
+            self._outputs.path(stamp_ns, trajectory.stamps, trajectory.poses)
             self._outputs.closures(stamp_ns, self._robot.closures())
+
+    def _publish_points(self, stamp_ns: int) -> None:
+        """Publish the points of a map in space if somebody asks for them: they are large."""
+        topic = resolved(self._namespace, POINTS)
+        if not any(each.topic == topic and not each.publishes and not each.own for each in self._network.endpoints()):
+            return
+        points = self._robot.points()
+        if points is None or not len(points) or (self._points is not None and np.array_equal(points, self._points)):
+            return
+        self._points = points
+        self._outputs.points(stamp_ns, points)
 
     def _publish_fleet(self) -> None:
         """Publish where the robots of the fleet are, at a fixed rate; frontiers, changes of the robot's map and how
@@ -220,7 +236,7 @@ class RobotNode:
         if self.sensors.restarts != self._restarts:
             self._restarts = self.sensors.restarts
             self._transforms.restart()
-        if not isinstance(record, LaserScan) or pose is None:
+        if not isinstance(record, LaserScan | CloudScan) or pose is None:
             return
         self.scans += 1
         self._pose = pose
@@ -230,10 +246,11 @@ class RobotNode:
         if np.isnan(pose.T_map_base[0]):
             self._transforms.pause()
             return
-        moved = pose.T_map_base if self.sensors.planner.is_without_odometry else pose.T_map_odom
+        T_map_odom = pose.T_map_odom if pose.T_map_base_6d is None else pose.T_map_odom_6d
+        moved = pose.pose if self.sensors.planner.is_without_odometry else T_map_odom
         if moved is not None:
             self._transforms.add(stamp_ns, self._clock.now_ns(), moved)
-        self._outputs.pose(stamp_ns, pose.T_map_base, pose.covariance)
+        self._outputs.pose(stamp_ns, pose.pose, pose.covariance_6d)
 
     def _publish_transforms(self) -> None:
         period_s = self._parameters.transform_publish_period

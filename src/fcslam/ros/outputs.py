@@ -14,7 +14,7 @@ from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray
 from fcslam.ros.network import Publish, Quality, RosNetwork
 from fcslam.ros.topics import resolved
-from fcslam.sources.bags.codec import TRANSFORMS, MessageCodec
+from fcslam.sources.bags.codec import POINT_CLOUD, TRANSFORMS, MessageCodec
 from fcslam.sources.bags.transforms import in_space
 
 if TYPE_CHECKING:
@@ -28,6 +28,10 @@ POSES, POSE_STAMPED = "geometry_msgs/PoseArray", "geometry_msgs/PoseStamped"
 
 MAP: Final = "map"
 """Topic of the map in the robot's namespace."""
+POINTS: Final = "cloud_map"
+"""Topic of the points of a map in space; other programs call it so, too."""
+_FLOAT32: Final = 7
+"""Number of this type in sensor_msgs/PointField."""
 OWN_MAP: Final = "own_map"
 """Topic of what a robot of a fleet saw itself."""
 FLEET_POSES, FLEET_STATUS = "fleet/poses", "fleet/status"
@@ -77,19 +81,17 @@ class Outputs:
         self._send(self._tf, TRANSFORMS, self._codec.transforms(header, odom_frame, in_space(T_map_odom)))
 
     def pose(self, stamp_ns: int, T_map_base: FloatArray, covariance: FloatArray) -> None:
-        """Publish the pose of a scan with its covariance (3, 3) over (x, y, theta)."""
+        """Publish the pose (P,) of a scan with its covariance (6, 6)."""
         make = self._codec.make
-        whole = np.zeros((6, 6))
-        planar = np.ix_((0, 1, 5), (0, 1, 5))
-        whole[planar] = covariance
+        whole = in_space(T_map_base)
         posed = make(
-            "geometry_msgs/PoseWithCovariance", pose=self._codec.pose(in_space(T_map_base)), covariance=whole.ravel()
+            "geometry_msgs/PoseWithCovariance", pose=self._codec.pose(whole), covariance=np.array(covariance.ravel())
         )
         header = self._codec.header(stamp_ns, self._map_frame)
         self._send("pose", POSE, make(POSE, header=header, pose=posed))
 
     def path(self, stamp_ns: int, stamps: FloatArray, T_map_base: FloatArray) -> None:
-        """Publish the path: stamps (N,) in seconds and poses (N, 3), thinned to steps of at least ``PATH_STEP_M``."""
+        """Publish the path: stamps (N,) in seconds and poses (N, P), thinned to steps of at least ``PATH_STEP_M``."""
         poses = [self._posed(nanoseconds(stamps[at]), T_map_base[at]) for at in _steps(T_map_base)]
         header = self._codec.header(stamp_ns, self._map_frame)
         self._send("path", PATH, self._codec.make(PATH, header=header, poses=poses))
@@ -138,6 +140,33 @@ class Outputs:
                 for one in maps
             ]
             self._diagnose(FLEET_QUALITY, now_ns, statuses)
+
+    def offer_points(self) -> None:
+        """Begin the topic of ``points``, so that others find it."""
+        with self._lock:
+            self._begin(POINTS, POINT_CLOUD, LATCHED)
+
+    def points(self, stamp_ns: int, points: FloatArray) -> None:
+        """Publish the points (N, 3) of the map in space."""
+        make, count = self._codec.make, len(points)
+        message = make(
+            POINT_CLOUD,
+            header=self._codec.header(stamp_ns, self._map_frame),
+            height=1,
+            width=count,
+            fields=[
+                make("sensor_msgs/PointField", name=axis, offset=4 * k, datatype=_FLOAT32, count=1)
+                for k, axis in enumerate("xyz")
+            ],
+            is_bigendian=False,
+            point_step=12,
+            row_step=12 * count,
+            data=np.frombuffer(points.astype("<f4").tobytes(), np.uint8),
+            is_dense=True,
+        )
+        with self._lock:
+            self._begin(POINTS, POINT_CLOUD, LATCHED)
+            self._send(POINTS, POINT_CLOUD, message)
 
     def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP) -> bool:
         """Publish a map if it changed; returns whether it did."""

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from math import inf
 from typing import Any, NamedTuple
 
-from fcslam.records import GnssFix, SensorRecord
+from fcslam.records import CloudScan, GnssFix, SensorRecord
 from fcslam.ros.live_plan import LivePlan, LivePlanner, Notify, missing_mounting
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.camera import ImageMessage, calibration_of, image_of
@@ -50,12 +50,13 @@ from fcslam.sources.bags.messages import (
 )
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.pairing import MAX_GAP_S, Message, PosedImage, PosedScan
-from fcslam.sources.bags.reader import Numbered, SensorReader
+from fcslam.sources.bags.reader import CloudStream, Numbered, SensorReader
 from fcslam.sources.bags.topics import info_beside
 from fcslam.sources.bags.transforms import NoTransformError
+from fcslam.sources.clouds_in_space import CloudReader, reader_of
 from fcslam.sources.faults import Audit, Fault
-from fcslam.sources.gate import MAX_STEP_BACK_S
-from fcslam.sources.point_clouds import directions_in, scan_of_cloud, unit_problem
+from fcslam.sources.gate import FIRST_MESSAGES, MAX_STEP_BACK_S
+from fcslam.sources.point_clouds import CloudMounting, PointCloud, directions_in, scan_of_cloud, unit_problem
 
 ODOMETRY_PATIENCE_S = MAX_GAP_S
 """Time that a scan waits for its odometry."""
@@ -69,7 +70,9 @@ _LONGEST_WAIT = 10_000
 """Most first messages that wait for the mounting."""
 
 
-Item = Message | ImuReading
+_MOST_CLOUDS = 100
+"""Most first clouds that wait; they are large."""
+Item = Message | ImuReading | PointCloud
 
 
 class _Early(NamedTuple):
@@ -129,7 +132,10 @@ class LiveSensors:
         """Topics with scans of other frames, of which there was a line."""
         self._plan: LivePlan | None = None
         """How the robot is read, once that is known."""
-        self._reader: SensorReader | None = None
+        self._reader: SensorReader | CloudStream | None = None
+        self._cloud_mounting: CloudMounting | None = None
+        self._cloud_reader: CloudReader | None = None
+        """Of a robot with a 3D LiDAR, once the plan is known."""
         self._early: deque[_Early] = deque(maxlen=_LONGEST_WAIT)
         self._axes: ImuAxes | None = None
         self._fixes: FixReader | None = None
@@ -163,7 +169,7 @@ class LiveSensors:
             if self._reader is not None:
                 yield from self._read(self._reader, self._counts[topic], item)
             elif not isinstance(item, ImageMessage):  # images are large, and the first ones show little
-                self._early.append(_Early(topic, self._counts[topic], received_ns, item))
+                self._keep(_Early(topic, self._counts[topic], received_ns, item))
         yield from self.wait(now_s)
 
     def wait(self, now_s: float) -> Iterator[SensorRecord]:
@@ -192,7 +198,22 @@ class LiveSensors:
         if self._reader is not None:
             yield from self._recorded(self._reader.finish())
 
-    def _new_reader(self, plan: LivePlan) -> SensorReader:
+    def _keep(self, early: _Early) -> None:
+        self._early.append(early)
+        clouds = [each for each in self._early if isinstance(each.item, PointCloud)]
+        if len(clouds) > _MOST_CLOUDS:
+            self._early.remove(clouds[0])
+
+    def _new_reader(self, plan: LivePlan) -> SensorReader | CloudStream:
+        if self._topics.in_space:
+            if self._cloud_reader is None:
+                first = [early.item for early in self._early if isinstance(early.item, PointCloud)]
+                assert self._cloud_mounting is not None  # each cloud has one before there is a plan
+                band, topic = self._options.cloud_band, self._topics.scans[0]
+                self._cloud_reader, notes = reader_of(first[:FIRST_MESSAGES], self._cloud_mounting, band, topic)
+                for note in notes:
+                    self._notify(note)
+            return CloudStream(self._cloud_reader, self.audit)
         return SensorReader(plan.lasers, not self.planner.is_without_odometry, self.audit)
 
     def _is_needless(self, kind: str, now_s: float) -> bool:
@@ -201,9 +222,10 @@ class LiveSensors:
             if now_s < self._next_image_s:
                 return True
             self._next_image_s = now_s + RAW_IMAGE_PERIOD_S
-        # Once the mountings are known, tf has nothing but the odometry. With odometry, no gyro is needed.
+        # Once the mountings are known, tf has nothing but the odometry. With odometry, only a 3D LiDAR needs the gyro.
         is_needed = kind != TRANSFORMS or self._topics.odometry is None
-        return self._plan is not None and not (is_needed and (kind != IMU or self.planner.is_without_odometry))
+        is_turned = self.planner.is_without_odometry or self._topics.in_space
+        return self._plan is not None and not (is_needed and (kind != IMU or is_turned))
 
     def _decide_clocks(self, plan: LivePlan) -> None:
         """Compare the clocks of the odometry and the IMU with that of the scans, by the first messages."""
@@ -212,9 +234,8 @@ class LiveSensors:
             item = restamped(early, received_ns, self._clocks[topic].lag_ns)
             is_other = isinstance(item, OdometryReading) and plan.edge not in (None, (item.odom_frame, item.base_frame))
             if not is_other and topic not in self._topics.scans[1:]:
-                end_s = item.end if isinstance(item, ScanMessage) else item.stamp
-                lags_s[type(item)].append(received_ns / NANOSECONDS - end_s)
-        self._scan_lags_s = lags_s[ScanMessage]
+                lags_s[type(item)].append(received_ns / NANOSECONDS - _end_s(item))
+        self._scan_lags_s = lags_s[PointCloud if self._topics.in_space else ScanMessage]
         name = self._topics.odometry or "the odometry in tf"
         self._odometry_ahead_s = self._ahead_s(name, lags_s[OdometryReading])
         self._imu_ahead_s = self._ahead_s(self._topics.imu or "", lags_s[ImuReading])
@@ -278,7 +299,8 @@ class LiveSensors:
         scan = self._scan(topic, content, received_ns)
         if scan is None:
             return []
-        scan = scan._replace(laser=laser)
+        if isinstance(scan, ScanMessage):
+            scan = scan._replace(laser=laser)
         if scan.frame != self._frames.setdefault(topic, scan.frame):
             if topic not in self._mixed:
                 self._mixed.add(topic)
@@ -288,12 +310,15 @@ class LiveSensors:
                 )
             self.audit.add(Fault.OTHER_BEAMS, self._counts[topic])
             return []
-        if self._plan is None:
+        if self._plan is None and isinstance(scan, ScanMessage):
             self.planner.add_scan(scan, is_stamped=stamp_ns_of(content.header) > 0)
         return [scan]
 
-    def _scan(self, topic: str, content: Any, received_ns: int) -> ScanMessage | None:
-        """The scan in a message; None while what it needs is awaited. Raises ValueError if the message is invalid."""
+    def _scan(self, topic: str, content: Any, received_ns: int) -> ScanMessage | PointCloud | None:
+        """The scan in a message, or the cloud if that is read whole; None while what it needs is awaited.
+
+        Raises ValueError if the message is invalid.
+        """
         kind, info = self._topics.kinds[topic], info_beside(topic)
         if kind in LASER_SCANS:
             return scan_of(content, received_ns)
@@ -304,23 +329,39 @@ class LiveSensors:
         if longest_s is None:
             return None
         cloud = cloud_of(content, kind, received_ns, self.planner.calibrations.get(info), longest_s)
-        if self._options.laser_poses:
-            pose = self._options.laser_poses[self._topics.scans.index(topic)]
-            mounting = given_cloud_mounting(pose, kind, cloud.frame)
-        else:
-            try:
-                T_base_sensor = self.planner.tree.fixed(self.planner.known_base_frame, cloud.frame)
-            except NoTransformError as error:
-                self.planner.awaited[topic] = missing_mounting(error)
-                return None
-            mounting = cloud_mounting(T_base_sensor, kind, cloud.frame)
-            if lacks_optical_frame(T_base_sensor, kind, cloud.frame):
-                self._notify(optical_note(topic, cloud.frame))
+        if self._topics.in_space and self._plan is not None:
+            return cloud
+        return self._first_cloud(topic, cloud, is_stamped=stamp_ns_of(content.header) > 0)
+
+    def _first_cloud(self, topic: str, cloud: PointCloud, is_stamped: bool) -> ScanMessage | PointCloud | None:
+        """The scan of a cloud; of one that is read whole, it shows the planner where the LiDAR is."""
+        kind, mounting = self._topics.kinds[topic], self._mounting(topic, cloud.frame)
+        if mounting is None:
+            return None
         if topic not in self._directions:
             for note in filter(None, (*notes_on_times(topic, kind, [cloud]), unit_problem([cloud]))):
                 self._notify(note)
             self._directions[topic] = directions_in([cloud], mounting)
-        return scan_of_cloud(cloud, mounting._replace(directions=self._directions[topic]), self._options.cloud_band)
+        scan = scan_of_cloud(cloud, mounting._replace(directions=self._directions[topic]), self._options.cloud_band)
+        if not self._topics.in_space:
+            return scan
+        self._cloud_mounting = mounting
+        self.planner.add_scan(scan, is_stamped)
+        return cloud
+
+    def _mounting(self, topic: str, frame: str) -> CloudMounting | None:
+        """Where the sensor of a topic of clouds sits; None while tf does not say."""
+        kind = self._topics.kinds[topic]
+        if self._options.laser_poses:
+            return given_cloud_mounting(self._options.laser_poses[self._topics.scans.index(topic)], kind, frame)
+        try:
+            T_base_sensor = self.planner.tree.fixed(self.planner.known_base_frame, frame)
+        except NoTransformError as error:
+            self.planner.awaited[topic] = missing_mounting(error)
+            return None
+        if lacks_optical_frame(T_base_sensor, kind, frame):
+            self._notify(optical_note(topic, frame))
+        return cloud_mounting(T_base_sensor, kind, frame)
 
     def _longest_cloud_s(self, topic: str, stamp: float, frame: str) -> float | None:
         """The longest time that a cloud takes, by the least time between two of them; None for the first."""
@@ -339,22 +380,29 @@ class LiveSensors:
             return []
         return [odometry_in(each) for each in transforms]
 
-    def _read(self, reader: SensorReader, number: int, item: Item) -> Iterator[SensorRecord]:
+    def _read(self, reader: SensorReader | CloudStream, number: int, item: Item) -> Iterator[SensorRecord]:
         plan = self._plan
         assert plan is not None  # nothing is read before
         if isinstance(item, ImuReading):
             self._axes = self._axes or ImuAxes(self.planner.tree, self.planner.base_frame)
-            reader.gyro.add(*self._axes.turn(item, self._imu_ahead_s))
+            if isinstance(reader, CloudStream):
+                yield from self._recorded(reader.add_imu(self._axes.row(item, self._imu_ahead_s)))
+            else:
+                reader.gyro.add(*self._axes.turn(item, self._imu_ahead_s))
             return
         if isinstance(item, OdometryReading):
-            if plan.edge not in (None, (item.odom_frame, item.base_frame)):
+            if self.planner.is_without_odometry or plan.edge not in (None, (item.odom_frame, item.base_frame)):
                 return
             item = item._replace(stamp=item.stamp - self._odometry_ahead_s)
+        if isinstance(item, ScanMessage | PointCloud) and self._has_stepped_back(item.stamp):
+            reader = self._reader = self._new_reader(plan)
         if isinstance(item, ScanMessage):
-            if self._has_stepped_back(item.stamp):
-                reader = self._reader = self._new_reader(plan)
             self._plan = plan._replace(rig=plan.rig.widened(item))
-        yield from self._recorded(reader.add(number, item))
+        if isinstance(reader, CloudStream):
+            if isinstance(item, PointCloud | OdometryReading):
+                yield from self._recorded(reader.add(number, item))
+        elif not isinstance(item, PointCloud):
+            yield from self._recorded(reader.add(number, item))
 
     def _has_stepped_back(self, stamp: float) -> bool:
         newest = self._newest_stamp
@@ -374,12 +422,14 @@ class LiveSensors:
         self._misplaced, self._newest_stamp = 0, stamp
         return True
 
-    def _recorded(self, entries: Iterator[Numbered]) -> Iterator[SensorRecord]:
+    def _recorded(self, entries: Iterator[Numbered] | Iterator[tuple[int, CloudScan]]) -> Iterator[SensorRecord]:
         for number, entry in entries:
             self._odometry_patience.forget()
             plan = self._plan
             assert plan is not None  # nothing is read before
-            if isinstance(entry, PosedScan):
+            if isinstance(entry, CloudScan):
+                yield entry
+            elif isinstance(entry, PosedScan):
                 yield plan.rig.scan(entry)
             elif isinstance(entry, PosedImage) and plan.rig.camera is not None:
                 try:
@@ -388,3 +438,9 @@ class LiveSensors:
                     self.audit.add(Fault.BROKEN_IMAGE, number)
         if self.audit.faults()[Fault.NO_ODOMETRY].count:
             self._notify("a scan has no odometry within 1 s and is left out; is the driver of the base alive?")
+
+
+def _end_s(item: Item) -> float:
+    if isinstance(item, PointCloud):
+        return item.stamp + float(item.times_s.max(initial=0.0))
+    return item.end if isinstance(item, ScanMessage) else item.stamp

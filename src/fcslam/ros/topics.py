@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from fcslam.errors import InputError, SourceError
 from fcslam.ros.network import Endpoint, published
-from fcslam.sources.bags.codec import FIX, IMAGE, IMU, ODOMETRY, TRANSFORMS
+from fcslam.sources.bags.codec import CLOUDS, FIX, IMAGE, IMU, ODOMETRY, TRANSFORMS
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
 from fcslam.sources.bags.topics import KnownTopics, calibration_beside, choose_topics
@@ -29,6 +29,8 @@ class SensorTopics:
     """Of satellite navigation."""
     notes: tuple[str, ...] = ()
     imu: str | None = None
+    in_space: bool = False
+    """Whether the scans are clouds of a 3D LiDAR that are read whole."""
 
 
 def resolved(namespace: str, name: str) -> str:
@@ -40,17 +42,20 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
     """Choose the topics to read in ``namespace``, by the rules for bags; nobody knows the fields of view.
 
     Fixes of satellite navigation are those of the topic that is first by name, and so are the readings of an IMU, which
-    are read if no topic has odometry. The topics of tf are the namespace's own
-    if there is one, else that of all robots.
+    are read if no topic has odometry, or in 3D, and clouds in 3D. The topics of tf are the namespace's own if there is
+    one, else that of all robots.
     """
     known = published(endpoints)
     every = [Topic(name, kind, 1) for name, kind in known.items()]
     inside = [topic for topic in every if topic.name.startswith(f"{namespace}/")]
     own_or_common = {f"{namespace}/{name}": f"/{name}" for name in (TF, TF_STATIC)}  # they may appear later
     transforms = [Topic(own if own in known else common, TRANSFORMS, 1) for own, common in own_or_common.items()]
+    scans = tuple(resolved(namespace, name) for name in options.scan_topics)
+    clouds = sorted(topic.name for topic in (every if scans else inside) if options.in_3d and topic.type in CLOUDS)
+    clouds = [name for name in clouds if name in (scans or clouds)][:1]
     wanted = replace(
         options,
-        scan_topics=tuple(resolved(namespace, name) for name in options.scan_topics),
+        scan_topics=tuple(clouds) or scans,
         odom_topic=options.odom_topic
         if options.odom_topic in (None, NO_ODOMETRY)
         else resolved(namespace, options.odom_topic),
@@ -70,7 +75,7 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
     transforms = list(dict.fromkeys((*(topic for topic in chosen.odometry if topic != odometry), *transforms)))
     depth_infos = [calibration_beside(topic, every) for topic in chosen.scans if topic.type == IMAGE]
     fixes = min((topic for topic in inside if topic.type == FIX), default=None)
-    imu = None if odometry else min((topic for topic in inside if topic.type == IMU), default=None)
+    imu = None if odometry and not clouds else min((topic for topic in inside if topic.type == IMU), default=None)
     read = (*chosen.scans, *depth_infos, *transforms, odometry, chosen.camera, chosen.camera_info, fixes, imu)
     return SensorTopics(
         {topic.name: topic.type for topic in read if topic is not None},
@@ -82,6 +87,7 @@ def choose_sensor_topics(endpoints: Sequence[Endpoint], namespace: str, options:
         fixes and fixes.name,
         chosen.notes,
         imu and imu.name,
+        bool(clouds),
     )
 
 

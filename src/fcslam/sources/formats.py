@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from fcslam.sources.bags.rosbag import RosBag
 
 LOG, BAG = "CARMEN log", "ROS bag"
+IN_PLANE = (
+    "{}: no point clouds, so its laser joins the 3D map: it fixes x, y and heading where a robot with a 3D LiDAR saw "
+    "the same walls, and needs level floors; without such a robot, leave out --3d"
+)
+"""What a robot with 2D scans does in a map in space."""
 _SCANS_SHARED = 20
 """Scans that two recordings share at least if they overlap."""
 
@@ -48,6 +53,15 @@ def whole_clouds(source: Source, options: BagOptions | None) -> Source:
     from fcslam.sources.bags.cloud_bag import in_3d
 
     return in_3d(source)
+
+
+def planar_note(sources: Sequence[Source]) -> str:
+    """What robots without clouds do in a map in space, one line; empty if all have clouds."""
+    from fcslam.sources.bags.cloud_bag import CloudBag
+    from fcslam.sources.cloud_files import CloudFolder
+
+    planar = [source.name for source in sources if not isinstance(source, CloudBag | CloudFolder)]
+    return IN_PLANE.format(", ".join(planar)) if planar else ""
 
 
 def bag_of(source: Source) -> "RosBag | None":

@@ -40,9 +40,15 @@ class FleetClient(HttpClient):
 
         None: nothing changed since the ETag ``known``, or the robot is in no map yet.
         """
-        headers = {"If-None-Match": known} if known else {}
-        path, nothing = f"robots/{robot}/map?limit={limit_bytes}", (304, 404)
-        response = self._ask("GET", path, headers=headers, passes=nothing)
+        return self._changed(f"robots/{robot}/map?limit={limit_bytes}", known)
+
+    def points(self, robot: str, known: str) -> tuple[bytes, str] | None:
+        """The points of the map in space that a robot is in, as a PLY file, and their ETag; None as for ``tiles``."""
+        return self._changed(f"robots/{robot}/points", known)
+
+    def _changed(self, path: str, known: str) -> tuple[bytes, str] | None:
+        nothing = (304, 404)
+        response = self._ask("GET", path, headers={"If-None-Match": known} if known else {}, passes=nothing)
         if response.status_code in nothing:
             return None
         return response.content, response.headers.get("ETag", "")

@@ -30,6 +30,7 @@ POSES = rectangle(29)
 SCRIPT = closures(("a", POSES), ("b", POSES), [(0, 0), (8, 8), (16, 16), (24, 24)])
 A, B = ([encode(packet) for packet in stream(robot, POSES, start_s)] for robot, start_s in (("a", 0.0), ("b", 500.0)))
 
+CLOUD = CloudConfig()
 TOKENS = {"a": Role.ROBOT, "b": Role.ROBOT, "eye": Role.VIEWER, "boss": Role.ADMIN}
 ENTRIES = [
     TokenEntry(name=name, role=role, sha256=hashlib.sha256(f"token of {name}".encode()).hexdigest())
@@ -72,10 +73,16 @@ class InlineWorker:
 class Desk:
     """The service, and requests to it as one of ``TOKENS`` or as nobody."""
 
-    def __init__(self, root: Path, tokens: Sequence[TokenEntry] | None = tuple(ENTRIES), **options: object) -> None:
+    def __init__(
+        self,
+        root: Path,
+        tokens: Sequence[TokenEntry] | None = tuple(ENTRIES),
+        config: CloudConfig = CLOUD,
+        **options: object,
+    ) -> None:
         """``options`` of uvicorn."""
         self.now = 0.0
-        missions = Missions(root, CloudConfig(), lambda: self.now, lambda: 1e9 + self.now, InlineWorker)
+        missions = Missions(root, config, lambda: self.now, lambda: 1e9 + self.now, InlineWorker)
         self.state = ServiceState(
             missions,
             Authenticator(tokens),

@@ -27,6 +27,7 @@ RIGHTS = {"robots": {Role.ROBOT}, "decisions": {Role.ADMIN}, "missions": {Role.A
 EXCEPTIONS = {
     ("GET", "/api/v1/detectors/{channel}/{version}"): set(Role),
     ("GET", "/api/v1/robots/{robot}/map"): set(Role),
+    ("GET", "/api/v1/robots/{robot}/points"): set(Role),
     ("GET", "/api/v1/frontiers"): set(Role),
     ("GET", "/api/v1/quality"): set(Role),
     ("GET", "/api/v1/missions"): READERS,

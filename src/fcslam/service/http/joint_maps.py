@@ -1,5 +1,6 @@
 """Routes for the fleet's map on every robot: tiles that changed, the poses of all robots, and where to explore."""
 
+import gzip
 import json
 import math
 import time
@@ -16,18 +17,20 @@ from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.config import StrictModel
 from fcslam.errors import InputError
 from fcslam.maps.joint_tiles import LARGEST_ANSWER
-from fcslam.maps.occupancy_map import FARTHEST_M
+from fcslam.maps.occupancy_map import FARTHEST_M, map_stem
 from fcslam.records import NAME
 from fcslam.runs import QUALITY
 from fcslam.service.http.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
-from fcslam.service.http.responses import file_of, refusals
+from fcslam.service.http.responses import file_of, refusals, unless_known
 from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
 from fcslam.service.joint_maps import Exploration, ServedJointMaps
-from fcslam.service.viewed_mission import viewed_run
+from fcslam.service.viewed_mission import run_of, viewed_run
+from fcslam.untrusted import read_bytes
 from fcslam.wire.fleet_replies import FleetReply, FrontierReply, MapFrontiers, QualityReply, TeammatePose
 
+BYTES = "application/octet-stream"
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False, strict=True)]
 
 
@@ -105,6 +108,22 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         body = batch.encode()
         state.measures.answer_map(robot, len(body))
         return Response(body, media_type=NETWORK, headers=headers)
+
+    @router.get("/robots/{robot}/points", dependencies=as_reader, **file_of(BYTES, is_tagged=True))
+    def get_points(request: Request, robot: Name) -> Response:
+        """The points of the map in space that a robot is in, as a PLY file that is as old as the live map."""
+        folder, sessions = state.mission.run_folder, run_of(state.mission).trajectories.values()
+        numbers = [one.map_index for one in sessions if robot_and_epoch(one.robot)[0] == robot]
+        if folder is None or not numbers:
+            raise HTTPException(404, f"robot '{robot}' is in no map yet")
+        file = folder / f"{map_stem(numbers[-1])}.ply"
+        if not file.exists():
+            raise HTTPException(404, f"the map of robot '{robot}' has no points in space yet")
+        answer = unless_known(request, read_bytes(file, folder), BYTES)
+        if answer.status_code == 200 and "gzip" in request.headers.get("accept-encoding", ""):
+            headers = {"ETag": answer.headers["etag"], "Content-Encoding": "gzip"}
+            return Response(gzip.compress(answer.body, 6, mtime=0), media_type=BYTES, headers=headers)
+        return answer
 
     @router.get("/frontiers", dependencies=as_reader)
     def get_frontiers(robot: Annotated[str | None, Query(pattern=f"^{NAME.pattern}$")] = None) -> list[MapFrontiers]:

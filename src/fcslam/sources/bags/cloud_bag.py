@@ -1,56 +1,28 @@
 """Reads the point clouds of a ROS bag whole, for a robot with a 3D LiDAR, with its wheels and its IMU."""
 
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import islice
-from typing import Final, NamedTuple
-
-import numpy as np
+from itertools import chain, islice
 
 from fcslam.errors import SourceError
-from fcslam.records import CloudScan, FloatArray, SensorRecord
+from fcslam.records import CloudScan, SensorRecord
 from fcslam.sources.bags.cloud_scans import valid
-from fcslam.sources.bags.codec import LIVOX_CLOUDS, POINT_CLOUD
+from fcslam.sources.bags.codec import CLOUDS
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.imu import ImuAxes, imu_of, imu_topics
 from fcslam.sources.bags.plan import BagPlan, plan_of
+from fcslam.sources.bags.reader import CloudStream
 from fcslam.sources.bags.robots import slashed
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.bags.transforms import USUAL_BASES
 from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, reader_of
 from fcslam.sources.faults import Audit, Fault, Faults
-from fcslam.sources.gate import FIRST_MESSAGES, MAX_STEP_BACK_S, check_consistency, scan_window
+from fcslam.sources.gate import FIRST_MESSAGES, check_consistency, scan_window
 from fcslam.sources.path_summary import PathSummary
-from fcslam.sources.point_clouds import PointCloud
 from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
 
 _audit = partial(Audit, "message")
-_LONGEST_WAIT: Final = 3
-"""Clouds that wait for the readings of other sensors; beyond, these have stopped."""
-
-
-class _Readings:
-    """Readings of a sensor that no cloud has carried yet."""
-
-    def __init__(self, columns: int) -> None:
-        self._rows: list[list[float]] = []
-        self._columns = columns
-        self.newest_s = -np.inf
-
-    def add(self, row: list[float]) -> None:
-        self._rows.append(row)
-        self.newest_s = row[0]
-
-    def take(self) -> FloatArray:
-        rows, self._rows = self._rows, []
-        return np.array(rows).reshape(-1, self._columns)
-
-
-class _Waiting(NamedTuple):
-    number: int
-    cloud: PointCloud
 
 
 class CloudBag:
@@ -109,53 +81,30 @@ class CloudBag:
         base_frame = self._bag.options.base_frame or next((f for f in USUAL_BASES if f in plan.tree), USUAL_BASES[-1])
         imu = imu_topics(self._bag.robot)[:1]
         odometry = () if plan.odometry is None else plan.odometry.topics
-        wheels, gyro, axes = _Readings(4), _Readings(7), ImuAxes(plan.tree, base_frame)
-        waiting: deque[_Waiting] = deque()
-        newest_s = -np.inf
+        stream, axes = CloudStream(reader, audit), ImuAxes(plan.tree, base_frame)
         for message in self._bag.bag.read([*odometry, *imu, self._topic]):
             try:
                 if message.topic == self._topic:
-                    cloud = plan.scans.cloud(message)
-                    if -MAX_STEP_BACK_S < cloud.stamp - newest_s <= 0.0:
-                        audit.add(Fault.REPEATED_STAMP, message.number)
-                        continue
-                    newest_s = cloud.stamp
-                    waiting.append(_Waiting(message.number, cloud))
+                    found = [stream.add(message.number, plan.scans.cloud(message))]
                 elif message.topic in imu:
-                    gyro.add(axes.row(imu_of(message.content, message.bag_time_ns)))
+                    reading = imu_of(message.content, message.unstamped_ns)
+                    found = [stream.add_imu(axes.row(reading, plan.imu_ahead_s))]
                 elif plan.odometry is not None:
-                    for reading in plan.odometry.readings(message):
-                        wheels.add([reading.stamp - plan.odometry_ahead_s, *reading.T_odom_base])
+                    readings = plan.odometry.readings(message)
+                    late_s = plan.odometry_ahead_s
+                    found = [stream.add(message.number, each._replace(stamp=each.stamp - late_s)) for each in readings]
             except ValueError:
                 audit.add(Fault.BROKEN_MESSAGE, message.number)
-            while waiting and (len(waiting) > _LONGEST_WAIT or _is_covered(waiting[0].cloud, wheels, gyro)):
-                yield from self._scan(reader, waiting.popleft(), wheels, gyro, audit)
-        while waiting:
-            yield from self._scan(reader, waiting.popleft(), wheels, gyro, audit)
-
-    @staticmethod
-    def _scan(
-        reader: CloudReader, waiting: _Waiting, wheels: _Readings, gyro: _Readings, audit: Audit
-    ) -> Iterator[tuple[int, CloudScan]]:
-        try:
-            yield waiting.number, reader.scan(waiting.cloud, wheels.take(), gyro.take())
-        except ValueError:
-            audit.add(Fault.NO_RETURN, waiting.number)
-
-
-def _is_covered(cloud: PointCloud, *sensors: _Readings) -> bool:
-    """Whether the readings of every sensor that has any reach the end of a cloud."""
-    end_s = cloud.stamp + float(cloud.times_s.max(initial=0.0))
-    return all(sensor.newest_s >= end_s or not np.isfinite(sensor.newest_s) for sensor in sensors)
+                continue
+            yield from chain.from_iterable(found)
+        yield from stream.finish()
 
 
 def in_3d(source: Source) -> Source:
     """The same recording with its clouds read whole, if it has any; else as it is, for a robot with a 2D laser."""
     if not isinstance(source, RosBag):
         return source
-    clouds = [
-        topic for topic in source.robot.topics if topic.type in (POINT_CLOUD, *LIVOX_CLOUDS) and topic.message_count
-    ]
+    clouds = [topic for topic in source.robot.topics if topic.type in CLOUDS and topic.message_count]
     if wanted := set(map(slashed, source.options.scan_topics)):
         clouds = [topic for topic in clouds if slashed(topic.name) in wanted]
     best = min(clouds, key=lambda topic: (-topic.message_count, topic.name), default=None)

@@ -53,8 +53,10 @@ class ImuAxes:
         self._tree, self._base_frame = tree, base_frame
         self._rotations: dict[str, FloatArray] = {}
 
-    def row(self, reading: ImuReading) -> list[float]:
-        """Stamp, angular velocity and specific force in the axes of the base."""
+    def row(self, reading: ImuReading, ahead_s: float = 0.0) -> list[float]:
+        """Stamp, angular velocity and specific force in the axes of the base, of a sensor whose clock is ``ahead_s``
+        ahead.
+        """
         if reading.frame not in self._rotations:
             try:
                 turn: Transform = self._tree.fixed(self._base_frame, reading.frame)
@@ -62,12 +64,12 @@ class ImuAxes:
             except NoTransformError:
                 self._rotations[reading.frame] = np.eye(3)
         rotation = self._rotations[reading.frame]
-        return [reading.stamp, *rotation @ reading.values[:3], *rotation @ reading.values[3:]]
+        return [reading.stamp - ahead_s, *rotation @ reading.values[:3], *rotation @ reading.values[3:]]
 
     def turn(self, reading: ImuReading, ahead_s: float) -> tuple[float, float]:
         """Stamp and angular velocity about the vertical, of a sensor whose clock is ``ahead_s`` ahead."""
-        stamp, _, _, rate_rad_s, *_ = self.row(reading)
-        return stamp - ahead_s, rate_rad_s
+        stamp, _, _, rate_rad_s, *_ = self.row(reading, ahead_s)
+        return stamp, rate_rad_s
 
 
 class GyroReadings:

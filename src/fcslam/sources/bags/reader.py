@@ -8,18 +8,26 @@ ends; a live robot asks which lasers are silent, and does not wait for them, or 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 
+import numpy as np
+
+from fcslam.records import CloudScan, FloatArray
 from fcslam.sources.bags.camera import ImageMessage
 from fcslam.sources.bags.imu import GyroReadings
-from fcslam.sources.bags.messages import ScanMessage
+from fcslam.sources.bags.messages import OdometryReading, ScanMessage
 from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedImage, PosedScan
 from fcslam.sources.bags.rig import RecordedLaser
 from fcslam.sources.bags.sectors import SectorJoiner
+from fcslam.sources.clouds_in_space import CloudReader
 from fcslam.sources.faults import Audit, Fault
-from fcslam.sources.gate import ScanGate
+from fcslam.sources.gate import MAX_STEP_BACK_S, ScanGate
+from fcslam.sources.point_clouds import PointCloud
 from fcslam.sources.pose import UNKNOWN_POSE
 
 _LONGEST_QUEUE = 20
 """Most scans of one laser that wait for scans of the others; beyond, another laser has paused."""
+
+_MOST_CLOUDS = 3
+"""Clouds that wait for the readings of other sensors; beyond, these have stopped."""
 
 Numbered = tuple[int, Entry]
 """An entry with the number of its message."""
@@ -143,3 +151,84 @@ class SensorReader:
                 if entry.fault is Fault.NO_ODOMETRY:
                     continue
             yield number, entry
+
+
+class _Readings:
+    """Readings of a sensor that no cloud has carried yet."""
+
+    def __init__(self, columns: int) -> None:
+        self._rows: list[list[float]] = []
+        self._columns = columns
+        self.newest_s = -np.inf
+
+    def add(self, row: list[float]) -> None:
+        self._rows.append(row)
+        self.newest_s = row[0]
+
+    def take(self) -> FloatArray:
+        rows, self._rows = self._rows, []
+        return np.array(rows).reshape(-1, self._columns)
+
+
+class CloudStream:
+    """Gives each cloud of a 3D LiDAR the readings of the other sensors, as they come.
+
+    A cloud waits until all of them reach its end, but not for a sensor that is silent.
+    """
+
+    silent_lasers: frozenset[int] = frozenset()
+    """As in ``SensorReader``: there is one LiDAR."""
+
+    def __init__(self, reader: CloudReader, audit: Audit) -> None:
+        """``audit`` counts the faults."""
+        self._reader, self._audit = reader, audit
+        self._wheels, self._imu = _Readings(4), _Readings(7)
+        self._waiting: deque[tuple[int, PointCloud]] = deque()
+        self._newest_s = -np.inf
+
+    def add(self, number: int, item: PointCloud | OdometryReading) -> Iterator[tuple[int, CloudScan]]:
+        """Read the next cloud or reading of message ``number``; yields the clouds that wait no longer."""
+        if isinstance(item, OdometryReading):
+            self._wheels.add([item.stamp, *item.T_odom_base])
+        elif -MAX_STEP_BACK_S < item.stamp - self._newest_s <= 0.0:
+            self._audit.add(Fault.REPEATED_STAMP, number)
+        else:
+            self._newest_s = item.stamp
+            self._waiting.append((number, item))
+        yield from self._complete()
+
+    def add_imu(self, row: list[float]) -> Iterator[tuple[int, CloudScan]]:
+        """Read stamp, angular velocity and specific force in the axes of the base."""
+        self._imu.add(row)
+        yield from self._complete()
+
+    @property
+    def waits_for_odometry(self) -> bool:
+        """Whether clouds wait for readings."""
+        return bool(self._waiting)
+
+    def skip_lasers(self) -> Iterator[tuple[int, CloudScan]]:
+        """Yield nothing: as there is one LiDAR, none waits for another."""
+        return iter(())
+
+    def skip_odometry(self) -> Iterator[tuple[int, CloudScan]]:
+        """Yield all that waits, with the readings that are there."""
+        while self._waiting:
+            yield from self._next()
+
+    finish = skip_odometry
+
+    def _complete(self) -> Iterator[tuple[int, CloudScan]]:
+        while self._waiting and (len(self._waiting) > _MOST_CLOUDS or self._is_covered(self._waiting[0][1])):
+            yield from self._next()
+
+    def _is_covered(self, cloud: PointCloud) -> bool:
+        end_s = cloud.stamp + float(cloud.times_s.max(initial=0.0))
+        return all(each.newest_s >= end_s or not np.isfinite(each.newest_s) for each in (self._wheels, self._imu))
+
+    def _next(self) -> Iterator[tuple[int, CloudScan]]:
+        number, cloud = self._waiting.popleft()
+        try:
+            yield number, self._reader.scan(cloud, self._wheels.take(), self._imu.take())
+        except ValueError:
+            self._audit.add(Fault.NO_RETURN, number)

@@ -70,7 +70,9 @@ def planar(transform: Transform) -> Pose:
 
 
 def in_space(pose: FloatArray) -> Transform:
-    """A pose on the floor, shape (3,), in three dimensions."""
+    """A pose in three dimensions: one on the floor, shape (3,), or in space, shape (7,)."""
+    if len(pose) == se3.IDENTITY.size:
+        return Transform(tuple(pose[:3].tolist()), tuple(pose[3:].tolist()))
     x, y, heading_rad = pose.tolist()
     return Transform((x, y, 0.0), (0.0, 0.0, sin(0.5 * heading_rad), cos(0.5 * heading_rad)))
 
