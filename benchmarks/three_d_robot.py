@@ -15,6 +15,7 @@ packets.
 
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import common
@@ -30,7 +31,7 @@ from fcslam.wire.packets import measure
 
 SENSORS = {"wheels, IMU": (True, True), "wheels": (True, False), "IMU": (False, True), "neither": (False, False)}
 DRIVES = "flat-7", "flat-202", "ramp-32", "ramp-101", "ramp-303", "ramp-404"
-COLUMNS = {"drive": "", "sensors": "", "turns": "", "sessions": "", "ATE (RMSE), m": ".4f", "in the plane, m": ".4f",
+COLUMNS = {"drive": "", "turns": "", "sessions": "", "ATE (RMSE), m": ".4f", "in the plane, m": ".4f",
            "max, m": ".3f", "rotation, deg": ".3f", "CPU, ms a turn": ".1f", "uplink, kB/s": ".1f"}  # fmt: skip
 
 
@@ -39,18 +40,19 @@ def main() -> None:
     parser.add_argument("bags", type=Path, help="folder of the bags")
     parser.add_argument("--drives", nargs="+", default=DRIVES)
     parser.add_argument("--sensors", nargs="+", choices=SENSORS, default=tuple(SENSORS))
+    parser.add_argument("--kept", type=Path, help="file that keeps finished drives, so that an interrupted run goes on")
     chosen = parser.parse_args()
-    rows = []
-    for drive in chosen.drives:
-        for sensors in chosen.sensors:
-            rows.append(row_of(chosen.bags / drive, sensors))
-            print(*rows[-1], flush=True)
-    report = common.Report(__file__, __doc__, chosen)
-    report.table("Drives", COLUMNS, rows)
+    kept, report = common.Kept(chosen.kept), common.Report(__file__, __doc__, chosen)
+    for sensors in chosen.sensors:
+        rows = []
+        for drive in chosen.drives:
+            rows += kept.rows((drive, sensors), partial(rows_of, chosen.bags / drive, sensors))
+            print(sensors, *rows[-1], flush=True)
+        report.table(f"Besides the LiDAR: {sensors}", COLUMNS, rows)
     report.write()
 
 
-def row_of(bag: Path, sensors: str) -> tuple:
+def rows_of(bag: Path, sensors: str) -> list[tuple[object, ...]]:
     has_wheels, has_imu = SENSORS[sensors]
     [source] = open_fleet([(bag, "anna")], BagOptions(in_3d=True))
     robot, packets = RobotFrontend3d("anna", SessionConfig()), []
@@ -66,7 +68,7 @@ def row_of(bag: Path, sensors: str) -> tuple:
     true = poses[np.abs(stamps[:, None] - track.stamps).argmin(axis=0)]
     uplink = sum(len(measure(packet).data) for packet in packets) / 1e3 / float(np.ptp(stamps))
     errors = errors_of(track.T_odom_base(), true)
-    return bag.name, sensors, len(stamps), len(robot.tracks), *errors, 1e3 * cpu_s / len(stamps), uplink
+    return [(bag.name, len(stamps), len(robot.tracks), *errors, 1e3 * cpu_s / len(stamps), uplink)]
 
 
 if __name__ == "__main__":

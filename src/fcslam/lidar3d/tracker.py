@@ -14,19 +14,18 @@ from numpy.typing import NDArray
 from fcslam.compiled import njit
 from fcslam.geometry import se3
 from fcslam.lidar3d.motion import MotionSensors
-from fcslam.lidar3d.surfels import POINT_SIGMA_M, SurfelMap
+from fcslam.lidar3d.surfels import POINT_SIGMA_M, SIZES_M, SurfelMap
 from fcslam.records import CloudScan, FloatArray
 from fcslam.sources.point_clouds import FARTHEST_M
 
 _STEPS: Final = 10
 """Parts of a turn between whose ends the predicted motion is interpolated."""
-_CELL_M, MOST_POINTS = 0.2, 3000
-"""Points that are registered: one for each such cell, or for larger ones if there are more."""
+MOST_POINTS: Final = 3000
+"""Points that are registered: one for each of the smallest voxels, or for larger cells if there are more."""
 _GATES_M: Final = (0.4, 0.28, 0.2, 0.14, 0.1, 0.1, 0.1, 0.1, 0.1)
 """Largest distance of a point from its surface in each iteration."""
-_CONVERGED: Final = 1e-4
-_ON_SURFACE_M, _NEAR_SURFACE_M = 0.06, 0.5
-"""Of the points that are near a surface, most are on it if the registration is right."""
+_NEAR_SURFACE_M: Final = 0.5
+"""Of the points that are so near to a surface, most are on it if the registration is right."""
 _CORRELATED: Final = 0.25
 """Information of a point: neighbours have the same error of their surface."""
 _POOR_FACTOR, _POOR_LEAST = 3.0, 0.02
@@ -122,7 +121,7 @@ class Tracker3d:
         predicted = self.sensors.predict(begin_s + np.linspace(0.0, length_s, _STEPS + 1))
         shares = (times - first_s) / length_s
         deskewed = _deskew(points, shares, predicted.poses)
-        chosen = thinned(deskewed, _CELL_M, MOST_POINTS)
+        chosen = thinned(deskewed, SIZES_M[-1], MOST_POINTS)
         fit = self._fitted(deskewed[chosen], shares[chosen], T_odom_begin, predicted.poses[-1], predicted.sigma)
         begin = se3.compose(T_odom_begin, se3.exp(fit.corrections[0]))
         end = se3.compose(T_odom_begin, se3.compose(se3.exp(fit.corrections[1]), predicted.poses[-1]))
@@ -233,11 +232,11 @@ def _fit(
         H, b = _CORRELATED * (trusted @ H @ trusted.T), _CORRELATED * (trusted @ trusted @ b)
         step = np.linalg.solve(H + prior, -(b + prior @ corrections))
         corrections = corrections + step
-        if gate_m == _GATES_M[-1] and np.abs(step).max() < _CONVERGED:
+        if gate_m == _GATES_M[-1] and np.abs(step).max() < 0.1 * _MAP_SIGMA.min():
             break
     near, on = (
         surfaces.normal_equations(points, shares, rotation, position, corrections.reshape(2, 6), gate_m)[3]
-        for gate_m in (_NEAR_SURFACE_M, _ON_SURFACE_M)
+        for gate_m in (_NEAR_SURFACE_M, 3.0 * POINT_SIGMA_M)
     )
     return _Fit(corrections.reshape(2, 6), inverse(H + prior), _CORRELATED * measured, on, on / max(near, 1))
 
