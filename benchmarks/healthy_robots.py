@@ -54,7 +54,7 @@ KINDS = {
     "times of beams": "a scan takes|all beams of a scan",
     "mounting": "the laser is mounted",
     "the robot's own body": "see the robot itself",
-    "ranges": "seem to be",
+    "ranges": "seem to be|repeats exactly",
     "faults of a record": "while the odometry|a laser saw nothing|skipped|kept|taken as|jumps of the odometry",
 }
 """A pattern of the lines of each kind."""

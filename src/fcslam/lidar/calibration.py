@@ -116,7 +116,7 @@ def calibrate(motions: ScanMotions, odometry: OdometryTrack) -> MotionCalibratio
     if turns >= FEWEST_PAIRS:
         delay, turn_scale = _delay_and_scale(motions, odometry, pairs)
         is_related = turn_scale.sigma <= LARGEST_SIGMA * abs(turn_scale.value)
-    is_related |= _turns_of(odometry.at(motions.stamps)[:, 2]) < 2 * FEWEST_PAIRS
+    is_related |= max(turns, _turns_of(odometry.at(motions.stamps)[:, 2])) < 2 * FEWEST_PAIRS
     if len(pairs) < FEWEST_PAIRS:
         return MotionCalibration(turn_scale=turn_scale, is_related=is_related)
     begins, ends = motions.stamps[pairs.T] + delay.value

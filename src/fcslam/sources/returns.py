@@ -4,8 +4,11 @@
 - Another unit: the values are too large for a 2D LiDAR, and as varied as ranges. A driver that sends a large number for
   no return sends few different ones.
 - Whole numbers: no laser rounds ranges to metres. Intensities are whole numbers.
+- A placeholder: one value repeats exactly in many beams at most places of a drive, and values near it are rare. Along a
+  wall they are not, as the beams beside the nearest one are a little longer, however coarse the ranges are.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from math import degrees, hypot, inf, remainder, tau
 from pathlib import Path
@@ -29,6 +32,10 @@ _TOO_FAR = 0.6
 """Share of varied values beyond the maximum that no laser has."""
 _WHOLE, _FEWEST_VALUES = 0.95, 3
 """Share of the different values that are whole where all are, and their least number."""
+_REPEATED, _PLACES = 0.1, 0.5
+"""Share of the beams that have a placeholder, and of the places at which as many have it."""
+_NEAR, _ABOVE_NEAR = 2, 5
+"""How many values to each side are near another, and how many times more frequent than these a placeholder is."""
 _KEPT = 256
 """Most scans that are kept."""
 _APART = 0.3
@@ -69,6 +76,8 @@ class _Sample(NamedTuple):
     values: Ranges
     range_min_m: float
     range_max_m: float
+    is_elsewhere: bool
+    """Whether the robot has moved since the sample before."""
 
 
 class RangeSample:
@@ -88,11 +97,28 @@ class RangeSample:
 
     def add(self, T_odom_base: Pose, values: Ranges, range_min_m: float, range_max_m: float) -> None:
         """Add a scan that is wanted, with its values as sent and the ranges that are returns."""
-        if self._last is None or is_apart(self._last, T_odom_base):
+        is_elsewhere = self._last is not None and is_apart(self._last, T_odom_base)
+        if self._last is None or is_elsewhere:
             self._last = T_odom_base
-        self._samples.append(_Sample(values, range_min_m, range_max_m))
+        self._samples.append(_Sample(values, range_min_m, range_max_m, is_elsewhere))
         if len(self._samples) > _KEPT:
             self._samples, self._step = self._samples[::2], 2 * self._step
+
+    def placeholders(self) -> tuple[float, ...]:
+        """The values that are not ranges."""
+        places = [sample for sample in self._samples if sample.is_elsewhere]
+        beams = sum(len(sample.values) for sample in places)
+        if len(places) < FEWEST:
+            return ()
+        values, counts = np.unique(np.concatenate([_returns(place) for place in places]), return_counts=True)
+        found = []
+        for value, count in zip(values[counts > _REPEATED * beams], counts[counts > _REPEATED * beams], strict=True):
+            at_index = int(np.searchsorted(values, value))
+            near = np.concatenate((counts[max(at_index - _NEAR, 0) : at_index], counts[at_index + 1 :][:_NEAR]))
+            at = sum(np.count_nonzero(place.values == value) > _REPEATED * len(place.values) for place in places)
+            if at > _PLACES * len(places) and count > _ABOVE_NEAR * near.max(initial=0):
+                found.append(float(value))
+        return tuple(found)
 
     def check(self, path: Path, which: str, remedy: str) -> None:
         """Refuse a recording that cannot be mapped.
@@ -132,6 +158,20 @@ class RangeSample:
                 f"check that the laser is not covered, {remedy}, and record again"
             )
         return ""
+
+
+def without(values: Ranges, placeholders: Sequence[float]) -> Ranges:
+    """The ranges with placeholders made invalid, NaN."""
+    if not placeholders:
+        return values
+    is_placeholder = np.isin(values, np.array(placeholders, np.float32))
+    return frozen(np.where(is_placeholder, np.float32(np.nan), values), np.float32)
+
+
+def placeholder_note(path: Path, placeholders: Sequence[float], which: str) -> list[str]:
+    """The notice about placeholders; empty without any."""
+    shown = ", ".join(f"{value:g}" for value in placeholders)
+    return [f"{path}: {shown} m repeats exactly in many beams{which} everywhere, so it is not a range"] * bool(shown)
 
 
 def is_apart(a: Pose, b: Pose) -> bool:

@@ -14,7 +14,7 @@ from fcslam.sources.pose import LARGEST_COORDINATE, Pose
 
 UNKNOWN_RANGE_M = 1000.0
 """Taken as the maximum of a laser that states none: 0, below 0 or not a number; and of one that states more."""
-SHORTEST_SWEEP_S, LONGEST_SWEEP_S = 1e-4, 1.0
+SHORTEST_SWEEP_S, LONGEST_SWEEP_S = 1e-4, 2.5
 """A scan that takes less is one at once; no scanner takes longer for a turn, so a larger time increment is wrong."""
 LONGEST_NAME = 255
 """Characters in the name of a topic or a frame, as in ROS 2."""

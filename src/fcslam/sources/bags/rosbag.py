@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import chain
+from itertools import chain, repeat
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,7 +32,7 @@ from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.path_summary import PathSummary
-from fcslam.sources.returns import RangeSample
+from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 _audit = partial(Audit, "message")
@@ -45,6 +45,7 @@ _OF_CLOUDS = "that a cloud is a whole turn, its points are in metres, its mounti
 class _Reading(NamedTuple):
     survey: Survey
     rig: Rig
+    placeholders: tuple[tuple[float, ...], ...]
     base_frame: str
 
 
@@ -105,7 +106,8 @@ class RosBag:
         """As in Source."""
         audit = self._audit = _audit()
         watch = ScanWatch(audit)
-        rig, correction = self._reading.rig, self.options.correction
+        rig, placeholders = self._reading.rig, self._reading.placeholders
+        correction = self.options.correction
         floors = [floor and floor.mirrored() if correction.upside_down else floor for floor in correction.floors]
         found, faults = self._fixes
         fixes = deque(found)
@@ -117,6 +119,8 @@ class RosBag:
                 record = rig.scan(entry)
                 while fixes and fixes[0].stamp <= record.stamp:
                     yield fixes.popleft()
+                if values := placeholders[entry.scan.laser]:
+                    record = replace(record, ranges_m=without(record.ranges_m, values))
                 if floors and (floor := floors[entry.scan.laser]) is not None:
                     record = floor.left_out(record)
                 watch.add(number, record)
@@ -196,6 +200,7 @@ class RosBag:
         which = [f" of {laser.name}" for laser in lasers]
         for sample, its, recorded in zip(samples, which, lasers, strict=True):
             sample.check(self.path, its, _OF_CLOUDS if recorded.is_level else _OF_SCANS)
+        placeholders = tuple(sample.placeholders() for sample in samples)
         base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
         mountings = [_moved(mounted, self.options.correction) for mounted in self._mountings(base_frame, errors)]
         camera, camera_note = None, ""
@@ -211,6 +216,7 @@ class RosBag:
             ),
             *chain.from_iterable(laser.notes(self.path, self.options.cloud_band) for laser in lasers),
             *plan.scans.notes,
+            *chain.from_iterable(map(placeholder_note, repeat(self.path), placeholders, which)),
             *self.robot.notes,
             *plan.topics.notes,
             *plan.odometry_notes,
@@ -226,7 +232,7 @@ class RosBag:
         survey = Survey(
             scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), (*self._notes, *notes), camera
         )
-        return _Reading(survey, rig, base_frame)
+        return _Reading(survey, rig, placeholders, base_frame)
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary, errors: Mapping[str, str]) -> None:
         path, topics, (laser, *_) = self.path, self.plan.topics, self.plan.lasers

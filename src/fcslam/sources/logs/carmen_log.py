@@ -23,7 +23,7 @@ from fcslam.sources.logs.carmen import BROKEN, SICK_MAX_RANGE_M, CarmenArrays
 from fcslam.sources.logs.laser import laser_model, usual_log_beams
 from fcslam.sources.path_summary import PathSummary, without_odometry
 from fcslam.sources.pose import UNKNOWN_POSE, pose_of
-from fcslam.sources.returns import RangeSample
+from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 _Entry = tuple[int, FloatArray]
@@ -35,6 +35,7 @@ class _Reading(NamedTuple):
     pose_from_odometry: bool
     """Whether scans take the pose of the latest odometry message, because their own never changes."""
     has_odometry: bool
+    placeholders: tuple[float, ...]
 
 
 class CarmenLog:
@@ -75,6 +76,7 @@ class CarmenLog:
                 audit.add(Fault.INVALID_RANGE, number, invalid)
             beams = log.beams_of(k, laser.beams)
             assert beams is not None  # as the gate says
+            ranges_m = without(ranges_m, reading.placeholders)
             scan = LaserScan(log.stamps[k], ranges_m, laser.with_beams(beams), T_odom_base)
             watch.add(number, scan)
             yield scan
@@ -116,15 +118,16 @@ class CarmenLog:
         laser = laser_model(log, telling, admitted)
         alone = without_odometry(duration_s / max(1, scan_count - 1))
         notes = [f"the odometry {driven.fault}; it is not used", alone] if driven.fault else []
+        placeholders = sample.placeholders()
         survey = Survey(
             scan_count,
             duration_s,
             driven.length_m,
             (laser,),
             faults,
-            tuple(f"{path}: {note}" for note in notes),
+            (*(f"{path}: {note}" for note in notes), *placeholder_note(path, placeholders, "")),
         )
-        return _Reading(survey, pose_from_odometry, driven.fault is None)
+        return _Reading(survey, pose_from_odometry, driven.fault is None, placeholders)
 
     def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, _Entry]]:
         """Lines with consistent scans, and with the readings of the odometry among them."""
