@@ -75,6 +75,18 @@ def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     assert (state / "keyframes").exists()
 
 
+def test_a_2d_recording_in_3d_is_told_what_its_laser_does(log, cloud, tmp_path, capsys):
+    cloud.canned.append((403, {}, b'{"error": "alice: sends poses in space"}'))
+    play = ["play", str(log), "--3d", "--server", cloud.url, "--state", str(tmp_path)]
+    assert main(play) != 0
+    assert "alice: sends poses in space (403)" in capsys.readouterr().err, (
+        "a service in the plane ends it with one line"
+    )
+    assert main([*play, "--resume"]) == 0
+    err = capsys.readouterr().err.replace("\n", " ")
+    assert err.count("alice: no point clouds, so its laser joins the 3D map") == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [

@@ -7,7 +7,8 @@ import pytest
 
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.settings import FleetConfig
-from fcslam.geometry import se2
+from fcslam.geometry import se2, se3
+from fcslam.geometry.groups import compose
 from fcslam.live.map_poses import CorrectedOdometry, MapPoses
 from fcslam.records import Correction, Keyscan
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
@@ -71,3 +72,22 @@ def test_own_closures_move_the_pose_while_the_server_is_away(is_away):
     assert np.array_equal(poses.T_map_own(0), T_map_own)
     assert poses.localizer(0).map_index == 1
     assert poses.localizer(1).map_index is None, "another session has its own corrections"
+
+
+def test_a_robot_with_a_2d_lidar_has_all_degrees_of_freedom_in_a_map_in_space(driven):
+    """The server's map is in space, the robot's own in the plane."""
+    odom, T_map_odom = driven[1].T_odom_base(), se3.exp((1.0, 2.0, 1.4, 0.02, -0.03, 0.5))
+    poses = MapPoses(lambda: 0.0)
+    poses.correct(0, CORRECTION, is_server_away=False)
+    assert poses.localizer(0).T_map_base(odom).shape == odom.shape
+    poses.correct_by_server(0, replace(CORRECTION, version=9, T_map_odom=T_map_odom))
+    found = poses.localizer(0).T_map_base(odom)
+    assert np.allclose(found, se3.compose(T_map_odom, se3.from_plane(odom)))
+    by_own = compose(poses.T_map_own(0), se2.compose(CORRECTION.T_map_odom, odom))
+    assert np.allclose(by_own, found), "both maps put the robot at the same place"
+    moved = replace(
+        CORRECTION, version=CORRECTION.version + 1, T_map_odom=se2.compose(CORRECTION.T_map_odom, (0.1, 0, 0))
+    )
+    poses.correct(0, moved, is_server_away=True)
+    step = se3.between(found, poses.localizer(0).T_map_base(odom))
+    assert np.allclose(np.linalg.norm(step[:, :3], axis=1), 0.1), "while the server is away, its own map counts"

@@ -19,6 +19,8 @@ from tests.carmen_logs import write_carmen
 from tests.lidar import worlds
 from tests.live.same_thread import SameThread
 from tests.robot.kidnapping import kidnapping
+from tests.spinning_lidar import circle, room
+from tests.spinning_lidar import drive as drive_lidar
 
 pytestmark = pytest.mark.slow
 
@@ -110,6 +112,25 @@ def test_without_a_scan_there_is_nothing_to_save(robot, tmp_path):
     with pytest.raises(InputError, match="no scan was added"):
         robot.save(tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_robot_with_a_2d_lidar_maps_in_space(scans, tmp_path):
+    space = {"fleet": {"dimensions": 3}}
+    with fcslam.Robot("anna", scans[0].laser, config=space, wiring=Wiring(SameThread())) as robot:
+        poses = drive(robot, scans)
+        robot.finish()
+        assert poses[-1].T_map_base_6d.shape == poses[-1].T_map_odom_6d.shape == (7,)
+        assert poses[-1].z == pytest.approx(0.0, abs=1e-6)
+        assert np.diag(poses[-1].covariance_6d)[2:5].tolist() == [0.0, 0.0, 0.0]
+        assert robot.trajectory().poses.shape == (len(scans), 7)
+        assert len(robot.points()) == 0, "a 2D LiDAR gives no points in space"
+        assert robot.own_map().cells.any()
+        run = robot.save(tmp_path / "run")
+        with pytest.raises(InputError, match="a turn of a 3D LiDAR; make the robot with lidar_3d=True"):
+            robot.add(next(drive_lidar(room(1), circle((6.0, 4.0), 1.6, 0.8), 1, azimuths=9))[0])
+    assert run.trajectories["anna"].T_map_base_6d.shape == (len(scans), 7)
+    with pytest.raises(InputError, match=r"a 3D LiDAR needs a map in space; set fleet.dimensions to 3 \(--3d\)"):
+        fcslam.Robot("anna", lidar_3d=True, wiring=Wiring(SameThread()))
 
 
 def test_a_run_can_be_saved_before_the_end(robot, scans, tmp_path):

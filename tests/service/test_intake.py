@@ -10,15 +10,17 @@ from hypothesis import strategies as st
 from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.replies import SessionCorrection
 from fcslam.errors import InputError, PacketConflictError, PacketError
+from fcslam.geometry import se3
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Correction, frozen
-from fcslam.service.intake import AGENT_LEASE_S, PACKET_BYTES, BusyError, Intake, RefusedPacketError
+from fcslam.service.intake import AGENT_LEASE_S, PACKET_BYTES, BusyError, Intake, PlaneError, RefusedPacketError
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS, MAXIMUM_PACKET_BYTES, VERSION
 from fcslam.wire.messages import Acknowledgement, Hello, Packet
 from fcslam.wire.packets import decode, encode
 from tests.scripted import rectangle, stream
+from tests.wire.examples import CLOSURE
 
 PACKETS = stream("a", rectangle(9), start_s=0.0)
 DATA = [encode(packet) for packet in PACKETS]
@@ -42,6 +44,17 @@ def desk(tmp_path):
     desk = Desk(tmp_path / "mission.sqlite")
     yield desk
     desk.store.close()
+
+
+def test_poses_in_space_are_stored_by_a_mission_in_space_alone(desk):
+    motion = replace(CLOSURE, robot="a", T_i_j=se3.from_plane(CLOSURE.T_i_j), information=np.eye(6))
+    in_space = encode(replace(PACKETS[0], sequence=1000, body=motion))
+    flat = Intake(desk.store, lambda: 0.0, lambda: 1e9, in_plane=True)
+    with pytest.raises(PlaneError, match="a: sends poses in space, and this mission is in the plane; begin one"):
+        flat.take("a", "x", write_batch([*DATA, in_space]), -1)
+    assert desk.store.arrivals(0, 10) == []
+    desk.take(*DATA, in_space)
+    assert len(desk.store.arrivals(0, 1000)) == len(DATA) + 1
 
 
 @pytest.mark.slow

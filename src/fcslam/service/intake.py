@@ -18,7 +18,7 @@ from fcslam.records import Channel, DetectorFile
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS, MAXIMUM_PACKET_BYTES
 from fcslam.wire.messages import UPLINK
-from fcslam.wire.packets import SizedPacket, decode, encode, read_number, unpacked_size
+from fcslam.wire.packets import SizedPacket, decode, encode, is_in_space, read_number, unpacked_size
 
 AGENT_LEASE_S = 30.0
 """How long after its last request an agent keeps its robot to itself."""
@@ -48,6 +48,10 @@ class RefusedPacketError(FcslamError):
     def __init__(self, message: str, index: int) -> None:
         super().__init__(message)
         self.index = index
+
+
+class PlaneError(FcslamError):
+    """A robot sends poses in space to a mission in the plane."""
 
 
 class SessionState(NamedTuple):
@@ -140,10 +144,12 @@ class Intake:
         agents: "Agents | None" = None,
         most_waiting: int = MOST_WAITING,
         most_refused_bytes: int = MOST_REFUSED_BYTES,
+        in_plane: bool = False,
     ) -> None:
         """``announced``: detectors that robots are to use; ``limits``: what a robot may send; ``agents``: who speaks
-        for the robots, if other instances know that as well.
+        for the robots, if other instances know that as well; ``in_plane``: no robot may send poses in space.
         """
+        self._in_plane = in_plane
         self._most_waiting, self._most_refused_bytes = most_waiting, most_refused_bytes
         self._limits = limits = limits or ClaimLimits()
         burst = max(20.0 * limits.packets_per_s, MAXIMUM_BATCH_PACKETS * MAXIMUM_PACKET_BYTES / PACKET_BYTES)
@@ -172,6 +178,7 @@ class Intake:
             RefusedPacketError: a packet of it is refused.
             PacketConflictError: another packet has the number of one of them; those before it are stored.
             InputError: another agent speaks for the robot.
+            PlaneError: it sends poses in space, and the mission is in the plane; nothing is stored.
             BusyError: it has to be sent again later.
             StoreError: the disk is full; nothing is stored.
         """
@@ -181,7 +188,7 @@ class Intake:
         encoded = read_batch(batch)
         self._limit_packets(robot, encoded)
         refused = self._limit_refused(robot, bool(encoded))
-        packets, refusal = _checked(robot, encoded)
+        packets, refusal = _checked(robot, encoded, self._in_plane)
         numbers = [(packet.robot, packet.epoch, packet.sequence) for packet in packets]
         self._limit_sessions(robot, {epoch for _, epoch, _ in numbers})
         self._make_room(robot, numbers)
@@ -292,12 +299,14 @@ def _take_tokens(buckets: TokenBuckets, robot: str, cost: float, limit: str) -> 
         raise BusyError(f"{robot}: over {limit} (fleet.claims); send the others in {wait_s:.0f} s", wait_s)
 
 
-def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], RefusedPacketError | None]:
+def _checked(
+    robot: str, batch: Sequence[bytes], in_plane: bool
+) -> tuple[list[StoredPacket], RefusedPacketError | None]:
     """The packets to be stored: all, or those up to and with the first that is refused."""
     packets: list[StoredPacket] = []
     for index, data in enumerate(batch):
         try:
-            packets.append(_read(robot, data))
+            packets.append(_read(robot, data, in_plane))
         except PacketError as error:
             number = read_number(data)
             if number is not None and number[0] == robot:
@@ -306,10 +315,15 @@ def _checked(robot: str, batch: Sequence[bytes]) -> tuple[list[StoredPacket], Re
     return packets, None
 
 
-def _read(robot: str, data: bytes) -> StoredPacket:
+def _read(robot: str, data: bytes, in_plane: bool) -> StoredPacket:
     sized = SizedPacket(decode(data), data)
     if sized.label.robot != robot:
         raise PacketError(f"a packet of robot {sized.label.robot}, sent by {robot}")
     if sized.label.kind not in UPLINK:
         raise PacketError(f"{robot}: a {sized.label.kind} goes to a robot, not to the cloud")
+    if in_plane and is_in_space(sized.packet.body):
+        raise PlaneError(
+            f"{robot}: sends poses in space, and this mission is in the plane; begin one with `fcslam serve --3d`, "
+            "or start the robot without --3d"
+        )
     return as_stored(sized)

@@ -206,7 +206,14 @@ class Missions:
         store = MissionStore(folder.store)
         try:
             settings = store.configure(self._config).fleet
-            intake = Intake(store, self._clock, self._wall_clock, self.detectors.announced, settings.claims)
+            intake = Intake(
+                store,
+                self._clock,
+                self._wall_clock,
+                self.detectors.announced,
+                settings.claims,
+                in_plane=settings.dimensions == 2,
+            )
         except BaseException:
             store.close()
             raise

@@ -80,9 +80,13 @@ def decode(data: bytes) -> Packet:
 
 def _version_of(body: Body) -> int:
     """The lowest version that has what the record needs."""
+    return limits.SPACE_VERSION if is_in_space(body) else limits.VERSION
+
+
+def is_in_space(body: Body) -> bool:
+    """Whether a record has poses in space."""
     pose = getattr(body, "T_i_j", getattr(body, "T_map_odom", None))
-    is_in_space = isinstance(body, VoxelMap) or (pose is not None and pose.shape == (7,))
-    return limits.SPACE_VERSION if is_in_space else limits.VERSION
+    return isinstance(body, VoxelMap) or (pose is not None and pose.shape == (7,))
 
 
 def readdress(data: bytes, epoch: int, sequence: int) -> bytes:

@@ -19,7 +19,7 @@ from fcslam.errors import (
     PacketError,
     StoreError,
 )
-from fcslam.service.intake import BusyError, RefusedPacketError
+from fcslam.service.intake import BusyError, PlaneError, RefusedPacketError
 from fcslam.service.missions import UnknownMissionError
 
 STATUS: dict[type[FcslamError], int] = {
@@ -27,6 +27,7 @@ STATUS: dict[type[FcslamError], int] = {
     RefusedPacketError: 400,
     PacketConflictError: 409,
     PacketError: 400,
+    PlaneError: 403,
     StoreError: 507,
     UnknownMissionError: 404,
     InputError: 409,

@@ -257,6 +257,14 @@ class SharedMissions:
                 store = MissionStore(MissionTables(self._server, known.number))
                 settings = store.configure(self._config).fleet
                 agents = SharedAgents(self._server, known.number, time.monotonic)
-                intake = Intake(store, time.monotonic, time.time, self.detectors.announced, settings.claims, agents)
+                intake = Intake(
+                    store,
+                    time.monotonic,
+                    time.time,
+                    self.detectors.announced,
+                    settings.claims,
+                    agents,
+                    in_plane=settings.dimensions == 2,
+                )
                 self._opened[name] = SharedMission(known.number, folder, self._server, store, intake, self._instance)
             return self._opened[name]
