@@ -8,8 +8,8 @@ import typer
 
 from fcslam.cli.listening import Credentials, check_tls, find_files, listen
 from fcslam.cli.options import ConfigFiles, Quiet, Space, WorkersOption, mission_config
-from fcslam.cli.output import notices
-from fcslam.cli.warm_up import report_uncached
+from fcslam.cli.output import notices, print_line
+from fcslam.cli.warm_up import EVERYTHING_S, report_uncached
 
 
 def serve(
@@ -69,7 +69,7 @@ def serve(
     from fcslam.service.http.authentication import Authenticator, read_tokens
     from fcslam.service.shared.missions import NAMED
     from fcslam.storage.files import keep_private
-    from fcslam.warmup import warm_up_decoding
+    from fcslam.warmup import is_cold, warm_up_decoding
 
     tokens, certificate, key = find_files(credentials)
     check_tls(certificate, key, client_ca)
@@ -91,7 +91,8 @@ def serve(
         else:
             state = serving.shared_state(store, listening.getsockname()[1], data, authenticator, given, workers)
         serving.reload_on_hangup(state, tokens)
-        report_uncached(notices(quiet))
+        if not report_uncached(notices(quiet)) and is_cold():
+            print_line(notices(quiet), f"compiling, first start only: about {EVERYTHING_S} s until maps are drawn")
         warm_up_decoding()
         gc.freeze()  # collecting these objects again and again would delay packets
         routers = [page_router(), report_router(state)]

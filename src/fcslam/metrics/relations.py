@@ -178,7 +178,7 @@ def read_relations(path: Path) -> Relations:
         with open_unpacked(path) as file, io.TextIOWrapper(file, encoding="utf-8") as lines:
             rows = _parse(lines, path)
     except (OSError, EOFError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot read the relations ({error})") from error
+        raise InputError(f"{path}: cannot read the relations ({error}); name the file of relations") from error
     if not rows:
         raise InputError(f"{path}: no relations in it; expected lines '{_COLUMNS}'")
     table = np.array(rows)

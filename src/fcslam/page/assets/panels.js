@@ -87,7 +87,7 @@ export function showMaps() {
 export function showAge() {
   const { counts, readOnly } = fleet;
   if (!counts) return;
-  at("age").textContent = readOnly || counts.map_age_s === null ? "" : `${lackOf(counts) || "The map is up to date"}. `;
+  at("age").textContent = readOnly || counts.map_age_s === null ? "" : `${counts.worker_ready ? lackOf(counts) || "The map is up to date" : "The worker starts; the first start compiles code for a minute"}. `;
   if (!link.connected) return; // the status says why
   at("status").textContent = readOnly ? "Finished run" : counts.worker_ready ? "Live" : "The map catches up after a start";
   at("status").dataset.kind = readOnly || counts.worker_ready ? "ok" : "wait";
