@@ -7,13 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.anchoring.anchors import Anchors, anchored, read_anchors
+from fcslam.anchoring.anchors import Anchors, anchored, anchoring_lines, read_anchors
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
 from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.report import fuse_members
 from fcslam.config import parse_yaml
 from fcslam.errors import SourceError
+from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
@@ -39,6 +40,26 @@ def test_a_map_is_given_in_the_coordinates_of_its_plan(T):
     assert report_of(placing)["aligned"]
     assert off_m(placing, true).max() < 0.05
     assert np.array_equal(placing.result.graph.poses(), placing.result.robots[0].T_map_base)
+
+
+def test_lines_of_any_width_are_walls():
+    result, true = mapped()
+    for cells in (4, 14):  # lines of 28 and 68 cm
+        lines = cv2.dilate((plan_of().cells == Occupancy.OCCUPIED).astype(np.uint8), np.ones((2 * cells + 1,) * 2))
+        wide = replace(plan_of(), cells=np.where(lines, Occupancy.OCCUPIED, Occupancy.FREE).astype(np.uint8))
+        assert off_m(placed(result, wide), true).max() < 0.05
+
+
+def test_a_plan_drawn_by_hand_places_the_map_and_leaves_its_shape():
+    result, _ = mapped()
+    by_hand = WALLS + 0.08 * np.sin(2.0 * np.pi * WALLS[:, [1, 0, 3, 2]] / 9.0)
+    placing = placed(result, plan_of(by_hand))
+    report = report_of(placing)
+    assert (report["aligned"], report["bent"]) == (True, False)
+    assert report["residuals"][1] > report["residuals"][0]
+    assert any("keeps its shape" in line for line in anchoring_lines(placing.files))
+    before, after = (one.robots[0].T_map_base for one in (result, placing.result))
+    assert se2.between(after[0], after) == pytest.approx(se2.between(before[0], before), abs=1e-9)
 
 
 @pytest.mark.parametrize("scale", [0.985, 1.01])

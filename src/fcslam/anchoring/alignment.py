@@ -32,6 +32,8 @@ LEAST_SHARE: Final = 0.3
 """Least share of the surface of a map, or of a scan, that the plan has: the rest is furniture."""
 LEAST_RIVAL_M: Final = 0.4 * LEAST_SURFACE_M
 """Score of an alignment elsewhere that is always assumed."""
+USUAL_WALL_M: Final = 0.08
+"""Half of the width of a wall: wider lines are first taken for walls of this width."""
 MOST_THICKNESS_M: Final = ON_SURFEL_M
 """Walls that differ in thickness by less on each side are drawn as lines of another width, or as one line."""
 
@@ -84,9 +86,10 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
     # SciPy's transforms take long to load.
     from fcslam.lidar.uniqueness import align_map, best_alignment, is_elsewhere, parallel_headings
 
-    target = plan.submap
     if not len(building.surface):
         return None
+    plan = replace(plan, thickness_m=min(0.0, USUAL_WALL_M - plan.half_width_m))
+    target = plan.submap
     if placed:
         best, lead = align_map(target, building, np.zeros(3)), np.inf
         if is_elsewhere(best.T_a_b, np.zeros(3), building.surface.points.mean(axis=0, keepdims=True)):
@@ -98,7 +101,7 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
         best, lead = found
     _, thickness_m = lengths_in_plan(target, building, best.T_a_b)
     if 0.0 < abs(thickness_m) < MOST_THICKNESS_M:
-        plan = replace(plan, thickness_m=thickness_m)
+        plan = replace(plan, thickness_m=plan.thickness_m + thickness_m)
         target = plan.submap
         best = align_map(target, building, best.T_a_b)
     of_plan = agreement(target, building, se2.inverse(best.T_a_b))

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from fcslam.anchoring.alignment import PlanAlignment
     from fcslam.anchoring.gnss import Georeference
     from fcslam.anchoring.plan import BuildingPlan
+    from fcslam.anchoring.plan_fit import PlanFit
     from fcslam.anchoring.surveyed_tags import Survey
 
 PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
@@ -97,8 +98,9 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
             if building is not None and not building.field.is_full and not anchors.plan.submap.field.is_full:
                 alignment = align_to_plan(anchors.plan, building, is_placed)
             if alignment is not None and not alignment.refusal:
-                part, scales = fit_to_plan(alignment.plan, part, alignment.T_plan_map)
-                reports.append(_plan_report(k, alignment, map_submap(part.robots), scales))
+                fit = fit_to_plan(alignment.plan, part, alignment.T_plan_map)
+                part = fit.part
+                reports.append(_plan_report(k, alignment, fit))
                 pictures.append(fuse(part.robots))
             else:
                 reports.append({"map": k, "aligned": False, "reason": _refusal(anchors.plan, building, alignment)})
@@ -142,10 +144,8 @@ def _refusal(plan: "BuildingPlan", building: Submap | None, alignment: "PlanAlig
     return f"{reason}; {misfit(plan, building)}"
 
 
-def _plan_report(k: int, alignment: "PlanAlignment", mapped: Submap, scales: Mapping[str, float]) -> dict[str, object]:
-    from fcslam.anchoring.deviations import compare_with_plan
-
-    compared = compare_with_plan(alignment.plan.submap, mapped)
+def _plan_report(k: int, alignment: "PlanAlignment", fit: "PlanFit") -> dict[str, object]:
+    compared = fit.compared[fit.is_bent]
     deviations = [
         {
             "kind": deviation.kind,
@@ -162,7 +162,10 @@ def _plan_report(k: int, alignment: "PlanAlignment", mapped: Submap, scales: Map
         "walls_seen": round(alignment.explained, 3),
         "confirmed_m": round(compared.confirmed_m, 1),
         "mean_off_m": round(compared.mean_off_m, 4) if compared.confirmed_m else None,
-        "scales": {robot: round(scale, 5) for robot, scale in scales.items()},
+        "scales": {robot: round(scale, 5) for robot, scale in fit.scales.items()},
+        "bent": fit.is_bent,
+        "off_m": [round(one.mean_off_m, 4) if one.confirmed_m else None for one in fit.compared],
+        "residuals": [round(residual, 4) for residual in fit.residuals],
         "deviations": deviations,
     }
 
@@ -228,6 +231,12 @@ def anchoring_lines(files: Mapping[str, bytes]) -> Iterator[str]:
             f"map {report['map']} is aligned with the plan: {report['confirmed_m']:.0f} m of walls confirmed, "
             f"{', '.join([*scales, f'{count} deviations of walls ({PLAN_JSON})'])}"
         )
+        if not report["bent"]:
+            (placed, bent), (was, becomes) = report["off_m"], report["residuals"]
+            yield (
+                f"map {report['map']} keeps its shape, which the plan would bend: its walls would be {bent} m from the "
+                f"plan instead of {placed} m, and its residuals {becomes} instead of {was}"
+            )
     if TAGS_JSON in files:
         from fcslam.anchoring.surveyed_tags import tag_lines
 

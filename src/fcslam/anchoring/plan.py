@@ -34,6 +34,13 @@ class BuildingPlan:
     """By how much the sides of walls lie farther from their middle than they are drawn."""
 
     @property
+    def half_width_m(self) -> float:
+        """Half of the usual width of its lines."""
+        inside = cv2.distanceTransform((self.drawing.cells == Occupancy.OCCUPIED).astype(np.uint8), cv2.DIST_L2, 5)
+        ridge = inside[(inside > 0.0) & (inside >= cv2.dilate(inside, np.ones((3, 3), np.uint8)))]
+        return (float(np.median(ridge)) - 0.5) * self.drawing.resolution_m if len(ridge) else 0.0
+
+    @property
     def sides_m(self) -> tuple[float, float]:
         """The shorter and the longer side of the plan."""
         shorter, longer = sides_m(np.argwhere(self.drawing.cells == Occupancy.OCCUPIED).astype(np.float64))

@@ -23,7 +23,7 @@ MOST_PIXELS: Final = 1 << 27
 """Largest number of pixels of a plan; 230 m by 230 m in pixels of 2 cm."""
 TEXT_M: Final = 0.5
 """Lines that are connected and no longer and no higher than this are text and symbols."""
-WALL_M: Final = 0.2
+WALL_M: Final = 0.4
 """Two lines this close together are the sides of one wall."""
 COLOUR_STEP: Final = 16
 """Colours in steps of this size are one colour where the background is found."""

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from fcslam.anchoring.alignment import LEAST_SHARE, lengths_in_plan
+from fcslam.anchoring.deviations import Comparison, compare_with_plan
 from fcslam.anchoring.part import ROUNDS, MapPart
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.cloud.result import MappedRobot
@@ -19,12 +20,18 @@ from fcslam.lidar.field import CELL_M
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import Submap, build_submap
+from fcslam.maps.certificate import QUIET
 from fcslam.records import FloatArray, frozen
 
 WEAK_M, WEAK_RAD = 0.05, 0.02
 """Least standard deviations of a pose by the plan, which is no more precise, however many points agree."""
 POINT_SIGMA_M: Final = 0.15
 """Standard deviation of a wall in the plan, per point of a scan: errors of a plan are the same for all its points."""
+
+MOST_RISE: Final = 2.0
+"""A plan that raises the residuals by more is drawn less exactly than the map."""
+LEAST_FALL: Final = 0.8
+"""Bending brings the walls nearer to the plan by at least this factor, or the map keeps its shape."""
 
 
 def map_submap(robots: Sequence[MappedRobot]) -> Submap:
@@ -37,11 +44,27 @@ def map_submap(robots: Sequence[MappedRobot]) -> Submap:
     return build_submap(scans, np.inf)
 
 
-def fit_to_plan(plan: BuildingPlan, part: MapPart, T_plan_map: FloatArray) -> tuple[MapPart, dict[str, float]]:
-    """Fit a map to the plan, from its alignment ``T_plan_map``, shape (3,), metres and radians.
+class PlanFit(NamedTuple):
+    """A map in the plan."""
 
-    Returns the map in the plan, with ranges in its scale, and the scale of each robot's lengths.
-    """
+    part: MapPart
+    """With ranges in the scale of the plan."""
+    scales: dict[str, float]
+    """Of each robot's lengths."""
+    residuals: tuple[float, float]
+    """Root mean square residual of the scans, in standard deviations: as the map was, and bent to the plan."""
+    compared: tuple[Comparison, Comparison]
+    """With the plan, as the map was, and bent to it."""
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether bending earns it: walls lie on the plan, and the scans do not contradict it."""
+        rises = self.residuals[1] > MOST_RISE * (self.residuals[0] + QUIET)
+        return not rises and self.compared[1].mean_off_m < LEAST_FALL * self.compared[0].mean_off_m
+
+
+def fit_to_plan(plan: BuildingPlan, part: MapPart, T_plan_map: FloatArray) -> PlanFit:
+    """Fit a map to the plan, from its alignment ``T_plan_map``, shape (3,), metres and radians."""
     robots, graph = part.robots, part.graph
     found = {
         robot.robot: lengths_in_plan(plan.submap, map_submap([robot]), T_plan_map)[0] if robot.keyscans else 1.0
@@ -72,7 +95,14 @@ def fit_to_plan(plan: BuildingPlan, part: MapPart, T_plan_map: FloatArray) -> tu
         if not priors:
             break
         poses = optimize_anchored(fitted.graph, poses, priors)
-    return fitted.at(poses), found
+    both = part.at(se2.compose(T_plan_map, part.graph.poses())), fitted.at(poses)
+    compared = [compare_with_plan(plan.submap, map_submap(one.robots)) for one in both]
+    fit = PlanFit(both[1], found, (_residual(both[0]), _residual(both[1])), (compared[0], compared[1]))
+    return fit if fit.is_bent else fit._replace(part=both[0], scales=dict.fromkeys(found, 1.0))
+
+
+def _residual(part: MapPart) -> float:
+    return float(np.sqrt(part.graph.chi2().mean())) if part.graph.edge_count else 0.0
 
 
 def _scaled(robot: MappedRobot, scale: float) -> MappedRobot:
