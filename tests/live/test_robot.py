@@ -131,6 +131,8 @@ def test_a_robot_with_a_2d_lidar_maps_in_space(scans, tmp_path):
     assert run.trajectories["anna"].T_map_base_6d.shape == (len(scans), 7)
     with pytest.raises(InputError, match=r"a 3D LiDAR needs a map in space; set fleet.dimensions to 3 \(--3d\)"):
         fcslam.Robot("anna", lidar_3d=True, wiring=Wiring(SameThread()))
+    with pytest.raises(InputError, match=r"uses no camera; leave out camera= \(--learn\)"):
+        fcslam.Robot("anna", lidar_3d=True, config=space, wiring=Wiring(SameThread(), keeps_keyframes=True))
 
 
 def test_a_run_can_be_saved_before_the_end(robot, scans, tmp_path):

@@ -131,6 +131,8 @@ class Robot(LiveTracker):
         super().__init__(name, laser, settings_of(config), on_event)
         if lidar_3d and self._config.fleet.group is SE2:
             raise InputError(f"{self.name}: a 3D LiDAR needs a map in space; set fleet.dimensions to 3 (--3d)")
+        if lidar_3d and (camera is not None or wiring.keeps_keyframes):
+            raise InputError(f"{self.name}: a robot with a 3D LiDAR uses no camera; leave out camera= (--learn)")
         self._camera = checked_camera(camera)
         self._clock = wiring.clock
         self._newest_session = 0
