@@ -2,7 +2,8 @@
 
 A scene shows a plane, or a turning camera took it. It is a folder with images ``1.*``, ``2.*`` ... and text files
 ``H_1_2``, ``H_1_3`` ..., 3 x 3 numbers each, which map pixels of image 1 to the other image. Its name begins with
-``i_`` if the illumination changes, with ``v_`` if the viewpoint changes.
+``i_`` if the illumination changes, with ``v_`` if the viewpoint changes. If a homography is rough, ``points_1_2.txt``
+has points of the plane, a line of x1 y1 x2 y2 each, and only these judge an estimate.
 """
 
 import time
@@ -131,10 +132,12 @@ def frame(path: Path, size: Size) -> FramedImage:
     return FramedImage(path, (width, height), framing, np.ascontiguousarray(scaled[top:, left:][: size[1], : size[0]]))
 
 
-def choose_detectors(names: Sequence[EvaluatedDetectorKind], weights: Sequence[Path]) -> tuple[EvaluatedDetector, ...]:
+def choose_detectors(
+    names: Sequence[EvaluatedDetectorKind], weights: Sequence[Path], scales: tuple[float, ...] = MATCHING_SCALES
+) -> tuple[EvaluatedDetector, ...]:
     """The named detectors; by default all available ones.
 
-    ``weights``: ONNX files, each a detector of its own; empty: the bundled network.
+    ``weights``: ONNX files, each a detector of its own; empty: the bundled network. ``scales``: of its image pyramid.
 
     Raises:
         FeatureError: a network's weights cannot be used.
@@ -145,7 +148,7 @@ def choose_detectors(names: Sequence[EvaluatedDetectorKind], weights: Sequence[P
         names = [name for name in EvaluatedDetectorKind if has_network or name not in _NETWORKS]
     detectors, networks = list[EvaluatedDetector](), list[Path | None](weights) or [None]
     for name in names:
-        detectors += [_network(name, path) for path in networks] if name in _NETWORKS else [_classical(name)]
+        detectors += [_network(name, path, scales) for path in networks] if name in _NETWORKS else [_classical(name)]
     doubled = {each.name for each in detectors if [other.name for other in detectors].count(each.name) > 1}
     if doubled:
         raise InputError(f"{min(doubled)}: named twice; give each detector and network once")
@@ -163,8 +166,8 @@ def one_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _network(name: EvaluatedDetectorKind, weights: Path | None) -> EvaluatedDetector:
-    network = OnnxDetector(OnnxConfig(weights=weights, most_features=_NETWORK_CANDIDATES, scales=MATCHING_SCALES))
+def _network(name: EvaluatedDetectorKind, weights: Path | None, scales: tuple[float, ...]) -> EvaluatedDetector:
+    network = OnnxDetector(OnnxConfig(weights=weights, most_features=_NETWORK_CANDIDATES, scales=scales))
     if name is EvaluatedDetectorKind.LOGITS:
         return _run_here(f"{network.version}-logits", partial(logit_features, network))
     return _run_here(network.version, network.detect)
@@ -203,16 +206,14 @@ class SceneKind(StrEnum):
 class Scene:
     """Images of one scene with known homographies."""
 
-    folder: Path
+    name: str
+    """Of its folder, after that of its set if two have one name."""
     reference: Path
     """Image 1."""
     others: tuple[tuple[Path, FloatArray], ...]
     """The other images, each with H (3, 3) from image 1 to it."""
-
-    @property
-    def name(self) -> str:
-        """Name of the folder."""
-        return self.folder.name
+    marks: Mapping[Path, tuple[FloatArray, FloatArray]]
+    """Of other images of which only some points are known: these in image 1 and there, pixels, shape (N, 2) each."""
 
     @property
     def kind(self) -> SceneKind:
@@ -232,13 +233,14 @@ def find_scenes(folders: Sequence[Path]) -> list[Scene]:
         if not found:
             raise InputError(f"{folder}: no scene in it; a scene is a folder with images 1, 2 ... and H_1_2 ...")
         for place in found:
-            if place.name in scenes:
-                raise InputError(f"{place}: there is another scene {place.name}; rename one")
-            scenes[place.name] = _read_scene(place)
+            name = place.name if place.name not in scenes else f"{place.parent.name}-{place.name}"
+            if name in scenes:
+                raise InputError(f"{place}: there is another scene {name}; rename one")
+            scenes[name] = _read_scene(name, place)
     return [scenes[name] for name in sorted(scenes)]
 
 
-def _read_scene(folder: Path) -> Scene:
+def _read_scene(name: str, folder: Path) -> Scene:
     images = {int(path.stem): path for path in sorted(folder.iterdir()) if path.suffix and path.stem.isdecimal()}
     files = sorted(folder.glob("H_1_*"))
     numbers = [path.name.removeprefix("H_1_") for path in files]
@@ -247,7 +249,19 @@ def _read_scene(folder: Path) -> Scene:
     if wrong or missing:
         raise InputError(f"{folder}: {f'what is {wrong[0]}?' if wrong else f'image {missing[0]} is missing'}")
     pairs = sorted((int(number), path) for number, path in zip(numbers, files, strict=True))
-    return Scene(folder, images[1], tuple((images[number], _read_homography(path)) for number, path in pairs))
+    others = tuple((images[number], _read_homography(path)) for number, path in pairs)
+    marked = ((images[number], folder / f"points_1_{number}.txt") for number, _ in pairs)
+    return Scene(name, images[1], others, {image: _read_marks(path) for image, path in marked if path.is_file()})
+
+
+def _read_marks(path: Path) -> tuple[FloatArray, FloatArray]:
+    try:
+        points = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot read the points ({error}); give lines of x1 y1 x2 y2") from error
+    if points.shape[1] != 4 or not np.isfinite(points).all():
+        raise InputError(f"{path}: no points; give lines of x1 y1 x2 y2")
+    return points[:, :2], points[:, 2:]
 
 
 def _read_homography(path: Path) -> FloatArray:

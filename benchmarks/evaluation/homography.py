@@ -3,7 +3,8 @@
 Each measure follows its original definition:
 
 - repeatability and localization error at 320 x 240, NMS 4, the 300 strongest in common view (SuperPoint);
-- homography from mutual nearest neighbours at 640 x 480 among the 1000 strongest in common view (SuperPoint);
+- homography from mutual nearest neighbours at 640 x 480 among the 1000 strongest in common view (SuperPoint), as the
+  mean of 50 orders of the matches: the result of RANSAC depends on it;
 - mean matching accuracy (D2-Net) and matching score (KP2D) at 640 x 480 among the 1000 strongest of each image.
 
 All but the first are computed with NMS 8 and without NMS.
@@ -34,7 +35,7 @@ from fcslam.learning.homography import (
     repeatability,
     warp,
 )
-from fcslam.metrics.bootstrap import Interval, mean_interval
+from fcslam.metrics.bootstrap import DRAWS, Interval
 from fcslam.records import FloatArray
 
 from .baselines import FloatFeatures
@@ -81,19 +82,40 @@ DescribedKeypoints = ImageFeatures | FloatFeatures
 AnyKeypoints = TypeVar("AnyKeypoints", bound=Keypoints)
 
 
+ESTIMATORS: Final = {"homography": cv2.RANSAC, "magsac": cv2.USAC_MAGSAC}
+"""Robust estimators of OpenCV, by the name of their measures."""
+ORDERS: Final = 50
+
+
+class Marks(NamedTuple):
+    """Where an estimated homography is judged: the same points of the plane in both images, pixels, shape (N, 2)."""
+
+    first: FloatArray
+    second: FloatArray
+
+    @classmethod
+    def corners(cls, H: FloatArray, size: Size) -> "Marks":
+        """The corners of image 1, and where H (3, 3) maps them."""
+        right, low = size[0] - 1.0, size[1] - 1.0
+        corners = np.array([[0.0, 0.0], [right, 0.0], [0.0, low], [right, low]])
+        return cls(corners, warp(H, corners))
+
+
 @dataclass(frozen=True, slots=True)
 class MatchingResult:
     """Matching measures of one pair of images."""
 
-    corner_error_px: float
-    """Corner error of the homography estimated from the matches; infinite without one."""
+    errors_px: FloatArray
+    """Error of the homographies by each of ``ESTIMATORS``, for ``ORDERS`` of the matches, shape (2, 50); infinite
+    without a homography."""
     accuracy: FloatArray
     """Matching accuracy at ``ACCURACY_PX``, shape (10,)."""
     score: float
     matches: int
 
 
-NO_MATCHES = MatchingResult(np.inf, np.zeros(len(ACCURACY_PX)), 0.0, 0)
+UNKNOWN = Repeatability(0, 0, 0.0)
+NO_MATCHES = MatchingResult(np.full((len(ESTIMATORS), ORDERS), np.inf), np.zeros(len(ACCURACY_PX)), 0.0, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +179,12 @@ def _evaluate_scene(
     is_described = isinstance(small[0].keypoints, DescribedKeypoints)
     large = _find_all(scene, detector, LARGE, stopwatch) if is_described else []
     for number, (path, H) in enumerate(scene.others, start=1):
-        again = repeat_pair(small[0].keypoints, small[number].keypoints, _true(H, small[0], small[number], truth))
-        matching = _match_all(large[0], large[number], _true(H, large[0], large[number], truth)) if large else {}
+        again, matching, marks = UNKNOWN, {}, scene.marks.get(path)
+        if marks is None:
+            again = repeat_pair(small[0].keypoints, small[number].keypoints, _true(H, small[0], small[number], truth))
+        if large:
+            framed = None if marks is None else _framed(Marks(*marks), large[0], large[number])
+            matching = _match_all(large[0], large[number], _true(H, large[0], large[number], truth), framed)
         yield PairResult(detector.name, scene.name, scene.kind, path.stem, again, matching)
 
 
@@ -172,10 +198,14 @@ def _true(H: FloatArray, first: _Found, second: _Found, truth: HomographyGroundT
     return framed_homography(H, first.picture.framing, second.picture.framing, truth)
 
 
-def _match_all(first: _Found, second: _Found, H: FloatArray) -> dict[int, MatchingResult]:
+def _framed(marks: Marks, first: _Found, second: _Found) -> Marks:
+    return Marks(warp(first.picture.framing.matrix, marks.first), warp(second.picture.framing.matrix, marks.second))
+
+
+def _match_all(first: _Found, second: _Found, H: FloatArray, marks: Marks | None) -> dict[int, MatchingResult]:
     """Matching measures for each NMS."""
     here, there = described(first.keypoints), described(second.keypoints)
-    return {nms_px: match_pair(thinned(here, nms_px), thinned(there, nms_px), H) for nms_px in MATCHING_NMS_PX}
+    return {nms_px: match_pair(thinned(here, nms_px), thinned(there, nms_px), H, marks) for nms_px in MATCHING_NMS_PX}
 
 
 def repeat_pair(first: Keypoints, second: Keypoints, H: FloatArray) -> Repeatability:
@@ -184,17 +214,26 @@ def repeat_pair(first: Keypoints, second: Keypoints, H: FloatArray) -> Repeatabi
     return repeatability(here, there, H, SMALL, IN_COMMON)
 
 
-def match_pair(first: DescribedKeypoints, second: DescribedKeypoints, H: FloatArray) -> MatchingResult:
-    """Match the keypoints of two images of size ``LARGE``, the strongest first; H (3, 3) is the true homography."""
+def match_pair(
+    first: DescribedKeypoints, second: DescribedKeypoints, H: FloatArray, marks: Marks | None = None
+) -> MatchingResult:
+    """Match the keypoints of two images of size ``LARGE``, the strongest first; H (3, 3) is the true homography.
+
+    ``marks``: all that is known exactly. Then H is that of a plane near them, and only gives the common view.
+    """
     common_first = first.take(in_common_view(_points(first), H, LARGE)[:MATCHED])
     common_second = second.take(in_common_view(_points(second), inverse(H), LARGE)[:MATCHED])
     first, second = first.take(slice(MATCHED)), second.take(slice(MATCHED))
     errors = match_errors(*matched_points(first, second), H)
     if not len(errors):
         return NO_MATCHES
+    judged = Marks.corners(H, LARGE) if marks is None else marks
+    errors_px = homography_errors(*matched_points(common_first, common_second), judged)
+    if marks is not None:
+        return MatchingResult(errors_px, np.full(len(ACCURACY_PX), np.nan), np.nan, len(errors))
     nearest = nearest_neighbours(first.descriptors, second.descriptors)
     return MatchingResult(
-        corner_error(estimate_homography(*matched_points(common_first, common_second)), H, LARGE),
+        errors_px,
         matching_accuracy(errors, ACCURACY_PX),
         matching_score((_points(first), _points(second)), nearest, H, LARGE),
         len(errors),
@@ -225,14 +264,14 @@ def _points(found: Keypoints) -> FloatArray:
     return found.keypoints_px.astype(np.float64)
 
 
-CORRECT_CORNERS_PX = (1, 2, 3, 5)
-"""Thresholds of the corner error of a correct homography."""
+CORRECT_PX = (1, 3, 5)
+"""Thresholds of the error of a correct homography."""
 
 
 def pair_measures(pair: PairResult) -> dict[str, float]:
     """All measures of a pair: ``repeatability``, ``localization_error_px``, and for each NMS n in pixels
-    ``homography_<e>px_nms<n>`` (0 or 1), ``accuracy_<t>px_nms<n>``, ``score_nms<n>``, ``matches_nms<n>`` and
-    ``corner_error_px_nms<n>``."""
+    ``homography_<e>px_nms<n>`` and ``magsac_<e>px_nms<n>`` (shares of the orders), ``accuracy_<t>px_nms<n>``,
+    ``score_nms<n>`` and ``matches_nms<n>``."""
     measures = {
         "repeatability": pair.repeatability.repeatability,
         "localization_error_px": pair.repeatability.localization_error_px,
@@ -256,12 +295,25 @@ def mean(pairs: Sequence[PairResult], measure: str, kind: SceneKind | None = Non
 
 def interval(pairs: Sequence[PairResult], measure: str, seed: int) -> Interval:
     """The mean over all pairs with its bootstrap interval."""
-    return mean_interval(column(pairs, measure), np.random.default_rng(seed))
+    return _by_scenes(pairs, column(pairs, measure), seed)
 
 
 def difference(first: Sequence[PairResult], other: Sequence[PairResult], measure: str, seed: int) -> Interval:
     """Mean difference ``first`` minus ``other`` on the same pairs, with its paired bootstrap interval."""
-    return mean_interval(column(first, measure) - column(other, measure), np.random.default_rng(seed))
+    return _by_scenes(first, column(first, measure) - column(other, measure), seed)
+
+
+def _by_scenes(pairs: Sequence[PairResult], values: FloatArray, seed: int) -> Interval:
+    """The mean of the pairs' values (N,), and its bootstrap over scenes: the pairs of a scene have one image 1."""
+    known = np.isfinite(values)
+    if not known.any():
+        return Interval(np.nan, np.nan, np.nan)
+    _, scene = np.unique([pair.scene for pair in pairs], return_inverse=True)
+    sums, counts = np.bincount(scene, np.where(known, values, 0.0)), np.bincount(scene, known)
+    sums, counts = sums[counts > 0], counts[counts > 0]
+    drawn = np.random.default_rng(seed).integers(len(sums), size=(DRAWS, len(sums)))
+    low, high = np.quantile(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1), (0.025, 0.975))
+    return Interval(float(values[known].mean()), float(low), float(high))
 
 
 def write_pairs(report: HomographyReport, path: Path) -> None:
@@ -282,32 +334,44 @@ def write_pairs(report: HomographyReport, path: Path) -> None:
 
 def _matching_measures(result: MatchingResult) -> dict[str, float]:
     return {
-        **{f"homography_{px}px": float(result.corner_error_px <= px) for px in CORRECT_CORNERS_PX},
+        **{
+            f"{name}_{px}px": float(np.mean(errors_px <= px))
+            for name, errors_px in zip(ESTIMATORS, result.errors_px, strict=True)
+            for px in CORRECT_PX
+        },
         **{f"accuracy_{px}px": float(share) for px, share in zip(ACCURACY_PX, result.accuracy, strict=True)},
         "score": result.score,
         "matches": float(result.matches),
-        "corner_error_px": result.corner_error_px,
     }
 
 
-def estimate_homography(first: FloatArray, second: FloatArray) -> FloatArray | None:
-    """Estimate H (3, 3) from matched points (N, 2), pixels, by RANSAC with OpenCV's defaults (3 px, 2000 iterations).
+def homography_errors(first: FloatArray, second: FloatArray, marks: Marks) -> FloatArray:
+    """Errors at the ``marks`` of homographies from matched points (N, 2), pixels; as ``MatchingResult.errors_px``."""
+    orders = [np.random.default_rng(k).permutation(len(first)) for k in range(ORDERS)]
+    return np.array(
+        [
+            [mark_error(estimate_homography(first[order], second[order], method), marks) for order in orders]
+            for method in ESTIMATORS.values()
+        ]
+    )
+
+
+def estimate_homography(first: FloatArray, second: FloatArray, method: int = cv2.RANSAC) -> FloatArray | None:
+    """Estimate H (3, 3) from matched points (N, 2), pixels, with OpenCV's defaults (3 px, 2000 iterations).
 
     Returns None if there are fewer than 4 matches or no solution.
     """
     if len(first) < 4:
         return None
-    H, _ = cv2.findHomography(first, second, cv2.RANSAC)
+    H, _ = cv2.findHomography(first, second, method)
     return None if H is None or H[2, 2] == 0.0 else np.asarray(H, np.float64)
 
 
-def corner_error(estimated: FloatArray | None, H: FloatArray, size: Size) -> float:
-    """Mean distance, pixels, of the corners of image 1 mapped by both homographies (3, 3); infinite if undefined."""
+def mark_error(estimated: FloatArray | None, marks: Marks) -> float:
+    """Mean distance, pixels, of the marks from where a homography (3, 3) maps them; infinite if undefined."""
     if estimated is None:
         return np.inf
-    right, low = size[0] - 1.0, size[1] - 1.0
-    corners = np.array([[0.0, 0.0], [right, 0.0], [0.0, low], [right, low]])
-    error = float(np.mean(np.linalg.norm(warp(estimated, corners) - warp(H, corners), axis=1)))
+    error = float(np.mean(np.linalg.norm(warp(estimated, marks.first) - marks.second, axis=1)))
     return error if np.isfinite(error) else np.inf
 
 

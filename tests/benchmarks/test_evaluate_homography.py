@@ -5,11 +5,14 @@ import numpy as np
 import pytest
 from evaluation.detectors import EvaluatedDetectorKind, SceneKind, choose_detectors, find_scenes
 from evaluation.homography import (
+    ESTIMATORS,
     LARGE,
+    ORDERS,
     SMALL,
     column,
     difference,
     evaluate_homography,
+    interval,
     match_pair,
     mean,
 )
@@ -77,6 +80,28 @@ def test_differences_are_those_of_the_pairs(report):
     assert gain.low <= gain.mean <= gain.high
 
 
+def test_where_only_points_are_known_they_alone_judge(scenes, report, tmp_path):
+    """The homography of the file is rough: five pixels off."""
+    pair = tmp_path / "pair"
+    pair.mkdir()
+    for number in (1, 2):
+        (pair / f"{number}.png").write_bytes((scenes / "v_turn" / f"{number}.png").read_bytes())
+    np.savetxt(pair / "H_1_2", np.array([[1.0, 0, 5], [0, 1, 0], [0, 0, 1]]) @ TURN)
+    here = np.random.default_rng(5).uniform((100, 100), (600, 300), (20, 2))
+    np.savetxt(pair / "points_1_2.txt", np.column_stack((here, warp(TURN, here))))
+    (judged,) = evaluate_homography(find_scenes([pair]), choose_detectors([EvaluatedDetectorKind.SIFT], [])).pairs
+    assert mean([judged], "homography_1px_nms0") == mean([judged], "magsac_1px_nms0") == 1.0
+    assert np.isnan([mean([judged], measure) for measure in ("repeatability", "accuracy_3px_nms0", "score_nms0")]).all()
+
+
+def test_intervals_draw_scenes(report):
+    """Two scenes have three pairs: whatever their errors, one scene alone gives the ends."""
+    pairs = report.of("sift")
+    values, ends = column(pairs, "accuracy_1px_nms0"), interval(pairs, "accuracy_1px_nms0", seed=1)
+    assert ends.mean == pytest.approx(values.mean())
+    assert sorted((values[:2].mean(), values[2])) == pytest.approx([ends.low, ends.high])
+
+
 def test_each_network_is_compared_by_its_bits_and_by_its_logits(scenes, tmp_path):
     paths = [tmp_path / f"{name}.onnx" for name in ("first", "second")]
     for seed, path in enumerate(paths):
@@ -104,5 +129,6 @@ def test_the_homography_is_judged_in_common_view_the_matches_among_the_strongest
     views = [np.vstack((alone[0], common)), np.vstack((alone[1], warp(shift, common)))]
     first, second = (ImageFeatures(points.astype(np.float32), scores, codes) for points in views)
     result = match_pair(first, second, shift)
-    assert result.corner_error_px < 1e-2
+    assert result.errors_px.shape == (len(ESTIMATORS), ORDERS)
+    assert result.errors_px.max() < 1e-2
     assert (result.matches, result.accuracy[9]) == (1000, pytest.approx(0.0, abs=0.01))

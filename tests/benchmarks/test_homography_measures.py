@@ -5,9 +5,10 @@ import pytest
 from evaluation.detectors import Framing
 from evaluation.homography import (
     HomographyGroundTruth,
-    corner_error,
+    Marks,
     estimate_homography,
     framed_homography,
+    mark_error,
     matching_score,
 )
 
@@ -49,7 +50,7 @@ def test_the_legacy_homography_forgets_the_crop_and_the_second_scale():
     by_hand = np.diag([s, s, 1]) @ H @ np.diag([1 / s, 1 / s, 1])
     assert np.allclose(framed_homography(H, first, second, HomographyGroundTruth.LEGACY), by_hand)
     corrected = framed_homography(H, first, second, HomographyGroundTruth.CORRECTED)
-    assert corner_error(by_hand, corrected, SIZE) > 20.0
+    assert mark_error(by_hand, Marks.corners(corrected, SIZE)) > 20.0
     uncut = Framing.of((640, 480), SIZE)
     pair = [framed_homography(H, uncut, uncut, truth) for truth in HomographyGroundTruth]
     assert np.allclose(pair[0], pair[1])
@@ -59,19 +60,19 @@ def test_ransac_finds_the_homography_among_wrong_matches():
     here = points(200)
     there = warp(H, here)
     there[:80] = points(80, seed=1)
-    assert corner_error(estimate_homography(here, there), H, SIZE) < 0.1
+    assert mark_error(estimate_homography(here, there), Marks.corners(H, SIZE)) < 0.1
     assert estimate_homography(here[:3], there[:3]) is None
     assert estimate_homography(np.ones((9, 2)), np.ones((9, 2))) is None
 
 
-def test_the_corner_error_is_the_mean_over_corners():
+def test_the_error_is_the_mean_over_corners():
     shift = np.array([[1.0, 0, 3], [0, 1, 4], [0, 0, 1]])
-    assert corner_error(shift, np.eye(3), SIZE) == pytest.approx(5.0)
-    assert corner_error(None, np.eye(3), SIZE) == np.inf
+    assert mark_error(shift, Marks.corners(np.eye(3), SIZE)) == pytest.approx(5.0)
+    assert mark_error(None, Marks.corners(np.eye(3), SIZE)) == np.inf
     scale = np.diag([2.0, 1.0, 1.0])
-    assert corner_error(scale, np.eye(3), SIZE) == pytest.approx((319 + 319) / 4)
+    assert mark_error(scale, Marks.corners(np.eye(3), SIZE)) == pytest.approx((319 + 319) / 4)
     folded = np.array([[1.0, 0, 0], [0, 1.0, 0], [-0.01, 0, 1.0]])
-    assert corner_error(folded, np.eye(3), SIZE) == np.inf
+    assert mark_error(folded, Marks.corners(np.eye(3), SIZE)) == np.inf
 
 
 def test_the_matching_score_is_that_of_the_loops():

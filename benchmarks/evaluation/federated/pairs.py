@@ -20,7 +20,7 @@ from fcslam.learning.labels import Labels
 from fcslam.learning.pairs import AugmentedView, TrainingExample, ViewPair, draw_pair
 from fcslam.records import Codes, FloatArray
 
-from ..homography import corner_error, estimate_homography
+from ..homography import Marks, estimate_homography, mark_error
 
 MEASURES: Final = ("homography_3px", "mma_3px", "repeatability", "mma_3px_former", "mma_3px_between")
 """Shares in [0, 1]. The last two match the measured network in the second view with another one in the first: the
@@ -81,7 +81,7 @@ def measure_pair(
     """
     first, second = (detect_features(detector, view) for view in pair.views)
     matched = _matched(first, second, pair)
-    error = corner_error(estimate_homography(*matched), pair.homography, VIEW)
+    error = mark_error(estimate_homography(*matched), Marks.corners(pair.homography, VIEW))
     again = repeatability(first.points, second.points, pair.homography, VIEW, MOST_POINTS).repeatability
     others = first if other is detector else detect_features(other, pair.views[0])
     accuracies = (_accuracy(_matched(features, second, pair), pair) for features in (legacy, others))

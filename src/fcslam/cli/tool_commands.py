@@ -68,12 +68,12 @@ def extract(
     """Find keypoints in images and describe each with 256 bits."""
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.features.classical import make_detector
-    from fcslam.features.detector import OnnxConfig
+    from fcslam.features.detector import MATCHING_SCALES, OnnxConfig
     from fcslam.features.files import extract_all, find_files
 
     named = detector in list(DetectorKind)
     kind = DetectorKind(detector) if named else DetectorKind.ONNX
-    onnx = OnnxConfig(weights=None if named else Path(detector), most_features=keypoints, scales=(1.0, 0.71, 0.5))
+    onnx = OnnxConfig(weights=None if named else Path(detector), most_features=keypoints, scales=MATCHING_SCALES)
     finder = make_detector(kind, onnx)
     files = [path for path in find_files(images) if path.suffix != ".npz"]  # an earlier output may be among them
     root = images.parent if images.is_file() else images
