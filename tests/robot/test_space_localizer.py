@@ -5,16 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fcslam.cli import main
 from fcslam.cloud.settings import FleetConfig
-from fcslam.errors import InputError, SourceError
+from fcslam.errors import SourceError
 from fcslam.geometry import se2, se3
 from fcslam.maps.joint_voxels import ply_of, read_points
-from fcslam.mission.localization import FinishedMap, run_localization
+from fcslam.mission.localization import read_finished, run_localization
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import KeyscanId, LaserModel, LaserScan, VoxelMap
 from fcslam.robot.space_localizer import SpaceMap
 from fcslam.runs import open_run
 from tests.flats import Recording
+from tests.sources.bag_messages import save
+from tests.sources.test_clouds_in_space import drive as drive_elsewhere
 from tests.spinning_lidar import cast, circle, drive, room
 
 pytestmark = pytest.mark.slow
@@ -50,9 +53,16 @@ def errors(run, pose_at):
 
 
 @pytest.fixture(scope="module")
-def finished():
+def folder(tmp_path_factory):
     run = run_mission([Recording(clouds(1, FIRST, 130), "anna")], MissionConfig(fleet=FleetConfig(dimensions=3)))
-    return FinishedMap(run.maps[0], run.map_files["map.ply"])
+    place = tmp_path_factory.mktemp("finished") / "run"
+    run.save(place)
+    return place
+
+
+@pytest.fixture(scope="module")
+def finished(folder):
+    return read_finished(folder)
 
 
 def localized(records, finished, **options):
@@ -91,9 +101,13 @@ def test_a_robot_in_another_building_stays_without_a_pose(finished):
     assert localized(clouds(5, OTHER, 130, seed=1), finished).metrics["fixes"].value == 0
 
 
-def test_clouds_update_no_map(finished):
-    with pytest.raises(InputError, match="carol: has clouds of a 3D LiDAR; only scans of a 2D laser update a map"):
-        localized(clouds(1, OTHER, 2), finished, update=True)
+def test_a_bag_of_clouds_is_localized_by_its_whole_clouds(folder, tmp_path, capsys):
+    bag = save(tmp_path / "drive.mcap", drive_elsewhere())
+    assert main(["localize", f"carol={bag}", "--map", str(folder), "-o", str(tmp_path / "run")]) == 0
+    assert "carol: not localized in 14 scans; is this the right map" in capsys.readouterr().out
+    assert (tmp_path / "run" / "map.ply").read_bytes() == (folder / "map.ply").read_bytes()
+    assert main(["localize", str(bag), "--map", str(folder), "-o", str(tmp_path / "other"), "--update"]) == 2
+    assert "has clouds of a 3D LiDAR; only scans of a 2D laser update a map" in capsys.readouterr().err
 
 
 def test_a_robot_stands_on_the_floor_with_its_inclination():
