@@ -87,13 +87,16 @@ def named_path(argument: str) -> tuple[Path, str | None]:
     # Path.exists raises for a name that is too long, and in a folder that cannot be searched.
     if not equals or not name or os.path.exists(argument):
         name, path = "", argument
-    with suppress(PermissionError):
-        try:
-            os.stat(path)
-        except (FileNotFoundError, NotADirectoryError):
-            raise InputError(f"{path}: no such file; check the path of the recording") from None
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error}); check the path of the recording") from error
+    # Several files of a bag are joined by commas, and a robot of it follows a colon.
+    files = [path] if os.path.exists(path) else (path.rpartition(":")[0] or path).split(",")
+    for file in files:
+        with suppress(PermissionError):
+            try:
+                os.stat(file)
+            except (FileNotFoundError, NotADirectoryError):
+                raise InputError(f"{file}: no such file; check the path of the recording") from None
+            except OSError as error:
+                raise InputError(f"{file}: cannot be read ({error}); check the path of the recording") from error
     return Path(path), name or None
 
 
