@@ -176,7 +176,6 @@ def test_edits_show_at_once_a_veto_its_undo_and_a_removed_robot(page, packets, t
             until(page, lambda: not vetoed.count() or len(maps(page)) == 2, "the veto")  # noqa: B023
         view(page, "attention")
         says(page, "#verdicts", "has another map")
-        page.get_by_role("button", name="Open edits").click()
         tabs = page.locator("#tabs button")
         for number in (1, 0):
             tabs.nth(number).click()
