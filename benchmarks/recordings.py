@@ -13,6 +13,9 @@ as `fcslam map` does. The error is that of the positions at all scans after a ri
 - wrong: the error is larger, and nothing is said.
 
 Clouds of 16 rings come at 10 Hz from a scanner that turns while the robot does.
+
+A gyro measures at 100 Hz, with a bias of 0.02 rad/s and noise of 0.005 rad/s. The scanner then turns at 5 Hz, and the
+robot at up to 2 rad/s.
 """
 
 # ruff: noqa: ARG005  all changes have the same arguments
@@ -28,11 +31,12 @@ import common
 import numpy as np
 
 from fcslam.geometry import se2
+from fcslam.sources.bags.codec import IMU, MessageCodec
 
 sys.path.insert(0, str(common.REPOSITORY))
 from tests.sources import clouds as made
 from tests.sources import test_drivers as drivers
-from tests.sources.bag_messages import odom, quaternion, save, tf
+from tests.sources.bag_messages import Said, odom, quaternion, save, tf
 from tests.sources.test_drivers import START, Scanner, pose_at
 
 RIGHT_M = 0.02
@@ -40,6 +44,7 @@ SAID = "contradict", "not corrected", "have no times", "was lost", "while the od
 """Parts of the lines that say what is wrong."""
 COLUMNS = {"kind": "", "recording": "", "error, m": ".4f", "outcome": "", "said": ""}
 COUNTS = {"kind": "", "recordings": "", "right": "", "said": "", "refused": "", "wrong": ""}
+GYRO_COLUMNS = {"wheels": "", "gyro": "", "error, m": ".4f"}
 CLOUD_COLUMNS = {"drive": "", "scans": "", "ATE (RMSE), m": ".4f"}
 MOUNTING = (0.1, 0.0, 0.4)
 YAW = 0.4
@@ -107,7 +112,39 @@ def main() -> None:
         report.table(
             "Clouds of 16 rings", CLOUD_COLUMNS, [rings(*each) for each in ((False, 0.0), (True, 0.0), (False, 6.0))]
         )
+    if not chosen.only:
+        report.table("Gyro", GYRO_COLUMNS, list(with_gyro()))
     report.write()
+
+
+def with_gyro() -> Iterator[tuple]:
+    """Drives of 18 s without wheels, and with wheels that slip by 20 % for a third of it."""
+    its = Scanner(hz=5.0, turns_s=0.2 * 359 / 360, pace=1.25)
+    mounting, *scans = [each for each in drivers.recording(its) if each.topic != "/odom"]
+    stamps = np.arange(0.0, drivers.SCANS / its.hz + 0.5, 0.02)
+    true = pose_at(its.pace * stamps)
+    steps = se2.between(true[:-1], true[1:])
+    steps[(stamps[1:] > 6.0) & (stamps[1:] < 12.0)] *= 1.2
+    wheels = [odom(START, true[0].tolist(), bag_time=START)]
+    pose = true[0]
+    for t, step in zip(stamps[1:].tolist(), steps, strict=True):
+        pose = se2.compose(pose, step)
+        wheels.append(odom(START + t, pose.tolist(), bag_time=START + t))
+    for name, odometry in (("none", []), ("slip", wheels)):
+        for imu in ([], list(turns(its.pace))):
+            with TemporaryDirectory() as folder:
+                path = save(Path(folder) / "run.mcap", [mounting, *odometry, *scans, *imu])
+                yield name, "yes" if imu else "no", drivers.outcome(path, pace=its.pace)[1]
+
+
+def turns(pace: float) -> Iterator:
+    rng, codec = np.random.default_rng(7), MessageCodec(ros1=False)
+    for t in np.arange(0.0, 18.5, 0.01).tolist():
+        rate = float(np.diff(pose_at(pace * (t + np.array((-1e-3, 1e-3))))[:, 2])[0]) / 2e-3
+        measured = codec.vector("Vector3", z=rate + 0.02 + float(rng.normal(0.0, 0.005)))
+        header = codec.header(round((START + t) * 1e9), "base_link")
+        payload = codec.encode(codec.make(IMU, header=header, angular_velocity=measured), IMU)
+        yield Said("/imu", "sensor_msgs/msg/Imu", START + t, {"payload": payload})
 
 
 def row(kind: str, name: str, messages: Iterable) -> tuple:

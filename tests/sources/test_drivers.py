@@ -55,6 +55,8 @@ class Scanner(NamedTuple):
     """Value per metre."""
     bent: float = 1.0
     """Stated angles per angle."""
+    pace: float = 1.0
+    """How many times as fast the robot drives."""
     frame: str = "laser"
     line: str = ""
     """A part of the lines that are printed."""
@@ -76,7 +78,7 @@ def scans_of(its: Scanner):
         share = np.arange(count) / (count - 1)
         times = begin + np.abs(duration) * (share if duration >= 0.0 else 1.0 - share)
         angles = its.first_rad + step * np.arange(count)
-        x, y, heading = pose_at(times).T
+        x, y, heading = pose_at(its.pace * times).T
         at = x + 0.12 * np.cos(heading), y + 0.12 * np.sin(heading)
         seen = plan_ranges(*at, heading + its.yaw_rad + (-angles if its.roll_rad else angles))
         seen = np.round((seen + rng.normal(0.0, its.noise_m, count)) / its.grid_m) * its.grid_m
@@ -103,7 +105,7 @@ def recording(its: Scanner) -> list[Said]:
     return [mounting, *readings(SCANS / its.hz), *scans_of(its)]
 
 
-def outcome(path, options=None):
+def outcome(path, options=None, pace=1.0):
     """The lines that are said, and the error of the path in metres, or None if it is refused."""
     try:
         source = calibrated(open_source(path, options), LidarConfig())
@@ -116,7 +118,7 @@ def outcome(path, options=None):
     frontend.finish()
     off = []
     for track in frontend.tracks:
-        true, estimated = pose_at(np.array(track.stamps) - START), track.T_odom_base()
+        true, estimated = pose_at(pace * (np.array(track.stamps) - START)), track.T_odom_base()
         off.append(se2.compose(align(true, estimated), estimated)[:, :2] - true[:, :2])
     lost = " the robot was lost" * (len(off) > 1)
     return said + lost, float(np.sqrt(np.mean(np.sum(np.vstack(off) ** 2, axis=1))))
