@@ -110,7 +110,7 @@ def calibrate(motions: ScanMotions, odometry: OdometryTrack) -> MotionCalibratio
     A short drive has the scales alone: their standard deviations say whether they mean anything.
     """
     pairs = _pairs(motions)
-    turns = np.count_nonzero(np.abs(_turn(motions, pairs)) > LEAST_TURN_RAD)
+    turns = int(np.count_nonzero(np.abs(_turn(motions, pairs)) > LEAST_TURN_RAD))
     delay, turn_scale = Estimate(0.0, 0.0), None
     is_related = False
     if turns >= FEWEST_PAIRS:
