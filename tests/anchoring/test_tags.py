@@ -128,10 +128,12 @@ def test_a_tag_seen_at_two_places_is_named():
     assert line.endswith("0.50 m apart")
 
 
-def test_a_wrong_size_is_named():
+@pytest.mark.parametrize("scale", [1.15, 1.5])
+def test_a_wrong_size_is_named_and_no_tag_is_blamed_for_it(scale):
     result, true = mapped()
-    said = lines(placed(result, sightings(true, scale=1.15)))
-    assert any("anna measures tags at 1.1" in line and "robot.tags.size_m" in line for line in said)
+    said = lines(placed(result, sightings(true, scale=scale)))
+    assert any(f"anna measures tags at {scale:.1f}" in line and "robot.tags.size_m" in line for line in said)
+    assert not any("was moved" in line for line in said)
 
 
 @pytest.mark.parametrize(

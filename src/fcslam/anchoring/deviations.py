@@ -26,8 +26,6 @@ SHORTEST_M: Final = 1.5
 """Shortest wall that is missing or moved: shorter lines of a plan are furniture and doors."""
 SHORTEST_NEW_M: Final = 2.0
 """Shortest new wall, as shorter surfaces are furniture; a missing wall that stands parallel within it has moved."""
-HIDDEN_M: Final = 0.5 * SHORTEST_NEW_M
-"""A new wall this close to a wall of the plan that no scan can see is that wall."""
 _STEPS: Final = round(2.0 * AWAY_M / SPACING_M)
 """Steps of ``SPACING_M`` to either side in which a wall is looked for."""
 JOINED_M: Final = 0.35
@@ -126,14 +124,8 @@ def compare_with_plan(plan: Submap, building: Submap) -> Comparison:
         by_m = wall.off_m if wall.off_m is not None else match[1] if match is not None else None
         kind = DeviationKind.MISSING if by_m is None else DeviationKind.MOVED
         found.append(Deviation(kind, *wall.ends(), by_m))
-    # A wall of which scans see one side may hide its place in the plan.
-    hidden = [wall for wall in _walls(points, normals, across, unseen & ~passed) if wall.length_m >= SHORTEST_M]
     for wall in (wall for k, wall in enumerate(new) if k not in taken and wall.length_m >= SHORTEST_NEW_M):
-        match = _moved(wall, hidden, HIDDEN_M)
-        if match is None:
-            found.append(Deviation(DeviationKind.NEW, *wall.ends()))
-        else:
-            found.append(Deviation(DeviationKind.MOVED, *hidden[match[0]].ends(), match[1]))
+        found.append(Deviation(DeviationKind.NEW, *wall.ends()))
     kept = [deviation for deviation in found if deviation.length_m >= SHORTEST_M]
     kept.sort(key=lambda deviation: (-deviation.length_m, deviation.start))
     mean_off_m = float(np.abs(across[confirmed]).mean()) if confirmed.any() else float("nan")

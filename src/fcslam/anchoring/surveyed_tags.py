@@ -293,8 +293,9 @@ def _solve(graph: PoseGraph, poses: FloatArray, tags: MapTags, used: Sequence[Ta
 
 def tag_lines(report: Mapping[str, Any]) -> Iterator[str]:
     """What ``tags.json`` says that a user should know, one sentence each."""
+    wrong = report["distances"].keys()
     for row in report["tags"]:
-        if row["doubtful"]:
+        if row["doubtful"] and not any(wrong & set(at["robots"]) for at in row["places"]):
             places = [f"{', '.join(at['robots'])} at ({at['x']:.2f}, {at['y']:.2f})" for at in row["places"]]
             gap_m = max(float(np.hypot(a["x"] - b["x"], a["y"] - b["y"])) for a, b in combinations(row["places"], 2))
             yield (
