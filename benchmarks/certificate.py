@@ -38,6 +38,8 @@ from fcslam.sources.faults import Faults
 from fcslam.sources.source import WHOLE, Survey
 
 BAR_M = 0.05
+DIFFERENT = "other", "mirrored", "shifted", "refurnished"
+"""Kinds of runs of two floors."""
 SCANNERS = (
     ("good scanner", 2, LidarSettings(beams=180, rate_hz=3.0)),
     ("medium scanner", 1, LidarSettings(beams=180, rate_hz=3.0, max_range_m=5.0, range_noise_m=0.03)),
@@ -100,16 +102,16 @@ def main() -> None:
 
 def of_floor(folder: Path) -> Iterator[JudgedMap]:
     """The maps of a run of ``real_floors.py`` whose robots were on one floor."""
-    if not (folder / "run" / "robots.csv").exists() or folder.name.startswith("onto"):
+    kind = folder.name.split("-")[0]
+    if not (folder / "truth").exists() or kind not in ("pair", "year", *DIFFERENT):
         return
     run = open_run(folder / "run", maps=False)
     truths = {path.name.removesuffix(".truth.tum"): read_tum(path) for path in (folder / "truth").iterdir()}
     floor = re.sub(r"^(pair|year|mirrored|shifted|refurnished|other-floor)-", "", folder.name)
     building = re.match(r"eng\d|gdc|[a-z0-9_]+", floor)
     name = floor if building is None else building[0]
-    same = folder.name.split("-")[0] not in ("mirrored", "shifted", "refurnished", "other")
     for k, members in members_of(run).items():
-        if len(members) == 1 or same:
+        if len(members) == 1 or kind not in DIFFERENT:
             poses = [run.trajectories[session].T_map_base for session in members]
             true = [interpolate(*truths[session.split("+")[0]], run.trajectories[session].stamps, 0.5)
                     for session in members]  # fmt: skip

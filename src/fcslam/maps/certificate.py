@@ -3,8 +3,8 @@
 The error of a place is the root mean square distance of the places around it from the truth, after the best rigid
 alignment of both: distances on the map within the surroundings are that wrong. The covariances of the graph give its
 expectation, but not its size, because no measurement counts as more precise than scan matching at its worst. What the
-measurements leave as residuals gives the size. ``QUANTILE`` is conformal: it is chosen so that the bound holds for 95 %
-of the maps of buildings (``benchmarks/certificate.py``).
+measurements leave as residuals gives the size. ``QUANTILE`` was chosen on maps of published floors;
+``benchmarks/certificate.py`` measures how often the bound holds, and the conformal quantile with each building left out.
 """
 
 import math
@@ -28,7 +28,7 @@ QUIET: Final = 0.1
 """Ratio of true errors to the standard deviations of the graph if its edges leave no residuals. It grows by their root
 mean square: 1 if the measurements scatter as the graph expects."""
 QUANTILE: Final = 3.0
-"""Ratio of the error that 95 % of the cells stay below to the expected one, in 95 % of the maps."""
+"""Ratio of the error that 95 % of the cells of a map stay below to the expected one, in most maps."""
 WITHIN_M: Final = 10.0
 CELL_M: Final = 1.0
 MOST_PLACES: Final = 600
