@@ -4,7 +4,7 @@ The error of a place is the root mean square distance of the places around it fr
 alignment of both: distances on the map within the surroundings are that wrong. The covariances of the graph give its
 expectation, but not its size, because no measurement counts as more precise than scan matching at its worst. What the
 measurements leave as residuals gives the size. ``QUANTILE`` was chosen on maps of published floors.
-``benchmarks/certificate.py`` measures how often the bound holds, and the conformal quantile with each building left out.
+``benchmarks/certificate.py`` measures how often the bound holds, and the conformal quantile without each building.
 """
 
 import math
