@@ -79,7 +79,7 @@ def test_a_surfel_has_the_normal_and_the_variances_of_its_points(seed: int) -> N
         (query - start)[None], np.zeros(1), np.eye(3), start, np.zeros((2, 6)), 0.1
     )
     assert count == 1
-    thin = values[0] + 3.0 * POINT_SIGMA_M**2 / len(points)
+    thin = values[0] * len(points) / (len(points) - 3.0)
     weight = 1.0 / (POINT_SIGMA_M**2 + thin / len(points) + 0.03**2 / 6.0)
     assert H[:3, :3] == pytest.approx(weight * np.outer(normal, normal), rel=1e-6, abs=1e-6 * weight)
     assert b[:3] == pytest.approx(weight * 0.03 * normal, rel=1e-6)

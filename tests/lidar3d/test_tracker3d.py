@@ -26,7 +26,7 @@ def test_poses_are_right_whatever_else_measures_the_motion(wheels: bool, gyro: b
     turns = drive(room(1), circle((6.0, 4.0), 0.8, 1.0), 63, wheels=wheels, gyro=gyro, scale=1.03)
     found = errors(tracker, turns)
     assert np.sqrt((found[:, :3] ** 2).sum(axis=1).mean()) < (0.015 if wheels or gyro else 0.03)
-    assert np.degrees(np.linalg.norm(found[:, 3:], axis=1).mean()) < 0.4
+    assert np.degrees(np.linalg.norm(found[:, 3:], axis=1).mean()) < (0.4 if wheels or gyro else 0.5)
     if gyro:
         assert tracker.sensors.bias.value[2] == pytest.approx(0.02, abs=0.01)
 

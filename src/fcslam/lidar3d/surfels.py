@@ -210,7 +210,7 @@ def _fit_planes(stats, planes, rows):  # type: ignore[no-untyped-def]
         C[1, 1], C[1, 2], C[2, 2] = s[7] / n - my * my, s[8] / n - my * mz, s[9] / n - mz * mz
         C[1, 0], C[2, 0], C[2, 1] = C[0, 1], C[0, 2], C[1, 2]
         values, vectors = np.linalg.eigh(C)
-        thin = max(values[0], 0.0) + 3.0 * POINT_SIGMA_M**2 / n  # three points always lie in a plane
+        thin = max(values[0], 0.0) * n / (n - 3.0)  # three points always lie in a plane
         if thin > THICKEST_M**2 or thin > _WIDEST_RATIO * values[1]:
             plane[6] = 0.0
             continue
