@@ -3,7 +3,7 @@
 import { colourOf, closures, firstStamp, fleet, keyOf, placed, robotNamed } from "./fleet.js";
 import { between, distance, middle, turned } from "./geometry.js";
 import { heightText } from "./heights.js";
-import { chart, choose, fit, goTo, openMap, redraw, showLayers } from "./map.js";
+import { chart, choose, goTo, openMap, redraw, showLayers } from "./map.js";
 import { ask, at, json, link, report } from "./service.js";
 import { change, tell } from "./tools.js";
 import { attention, count, dayOf, decisionOf, duration, editOf, history, lackOf, listed, metres, moment, nameOf, plotsOf, sensorOf, stateOf, verdictOf } from "./words.js";
@@ -110,7 +110,7 @@ function showPlots(list, samples) {
   list.replaceChildren(...plotsOf(samples).flatMap(({ name, values, newest }) => {
     const line = Object.assign(document.createElement("canvas"), { width: 240, height: 32, role: "img", ariaLabel: `${name}: ${newest}` }), pen = line.getContext("2d"), most = Math.max(...values, 1e-9);
     pen.strokeStyle = getComputedStyle(list).getPropertyValue("--accent"); pen.lineWidth = 1.5;
-    values.forEach((value, k) => pen.lineTo((k / (values.length - 1)) * 240, 30 - (28 * value) / most));
+    for (const [k, value] of values.entries()) pen.lineTo((k / (values.length - 1)) * 240, 30 - (28 * value) / most);
     pen.stroke();
     return [element("dt", `${name}: ${newest}`), element("dd", line)];
   }));
