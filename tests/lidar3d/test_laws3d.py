@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.geometry import se3
 from fcslam.geometry.voxels import VOXEL_STEPS, voxelised
-from fcslam.lidar3d.ground import floor_at, levelled
+from fcslam.lidar3d.ground import Vertical, floor_at, levelled
 from fcslam.lidar3d.surfels import FEWEST_POINTS, POINT_SIGMA_M, SurfelMap
 from fcslam.lidar3d.tracker import Tracker3d, without_noise
 from fcslam.records import STEP_M
@@ -53,6 +53,17 @@ def test_no_floor_is_found_in_a_wall_or_in_a_strip() -> None:
     assert floor_at(wall) is None
     assert floor_at(strip) is None
     assert floor_at(strip[: FEWEST_POINTS - 1]) is None
+
+
+def test_up_is_that_of_most_floors_though_a_robot_starts_on_a_ramp() -> None:
+    generator, vertical = np.random.default_rng(3), Vertical()
+    ramp, level = np.array([-0.12, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
+    for direction in [*4 * [ramp], *8 * [level]]:
+        vertical.add(direction + generator.normal(0.0, 0.005, 3))
+    assert np.arccos(vertical.up @ level) < 0.005
+    for _ in range(7):
+        vertical.add(ramp)
+    assert vertical.up @ level < 0.995, "most of the drive was on the ramp"
 
 
 def one_plane(seed: int, count: int = 400) -> tuple[SurfelMap, np.ndarray, np.ndarray]:

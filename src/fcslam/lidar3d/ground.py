@@ -1,7 +1,7 @@
 """Where the floor is around a robot with a 3D LiDAR, and what a 2D laser above it would see.
 
 The floor is where wheels stand: it follows the robot over ramps. Up is the direction of gravity. Without an IMU, it is
-the normal of the floors that agree with the first one, so that a ramp does not count.
+the normal of most floors, so that a ramp does not count.
 """
 
 from math import cos, radians
@@ -47,21 +47,25 @@ def floor_at(points: FloatArray) -> tuple[FloatArray, float] | None:
 
 
 class Vertical:
-    """The direction of up in ``odom``."""
+    """The direction of up in ``odom``: that of most keyframes, as a robot may start on a ramp."""
 
     def __init__(self) -> None:
         self.up = np.array([0.0, 0.0, 1.0])
-        self._count = 0
+        self._found: list[tuple[FloatArray, int]] = []
+        """Directions that differ, and how often each was measured."""
 
     def add(self, direction: FloatArray) -> None:
         """Take a measured direction (3,): of a floor, or of the specific force at rest."""
         direction = direction / np.linalg.norm(direction)
-        if self._count and direction @ self.up < _SAME_FLOOR:
-            return
-        self._count += 1
-        rate = max(_RATE, 1.0 / self._count)
-        self.up = self.up + rate * (direction - self.up)
-        self.up /= np.linalg.norm(self.up)
+        near = [float(direction @ mean) for mean, _ in self._found]
+        if not near or max(near) < _SAME_FLOOR:
+            self._found.append((direction, 1))
+        else:
+            k = int(np.argmax(near))
+            mean, count = self._found[k][0], self._found[k][1] + 1
+            mean = mean + max(_RATE, 1.0 / count) * (direction - mean)
+            self._found[k] = mean / np.linalg.norm(mean), count
+        self.up = max(self._found, key=lambda found: found[1])[0]
 
 
 def levelled(T_odom_base: FloatArray, up: FloatArray, height_m: float) -> FloatArray:

@@ -210,8 +210,10 @@ def _fit_planes(stats, planes, rows):  # type: ignore[no-untyped-def]
         C[1, 1], C[1, 2], C[2, 2] = s[7] / n - my * my, s[8] / n - my * mz, s[9] / n - mz * mz
         C[1, 0], C[2, 0], C[2, 1] = C[0, 1], C[0, 2], C[1, 2]
         values, vectors = np.linalg.eigh(C)
-        thin = max(values[0], 0.0) * n / (n - 3.0)  # three points always lie in a plane
-        if thin > THICKEST_M**2 or thin > _WIDEST_RATIO * values[1]:
+        measured = max(values[0], 0.0)
+        thin = measured * n / (n - 3.0)  # three points always lie in a plane
+        is_line = values[1] < POINT_SIGMA_M**2
+        if is_line or thin > THICKEST_M**2 or thin > _WIDEST_RATIO * values[1]:
             plane[6] = 0.0
             continue
         nx, ny, nz = vectors[0, 0], vectors[1, 0], vectors[2, 0]
@@ -219,7 +221,8 @@ def _fit_planes(stats, planes, rows):  # type: ignore[no-untyped-def]
             nx, ny, nz = -nx, -ny, -nz
         plane[0], plane[1], plane[2], plane[3], plane[4], plane[5] = nx, ny, nz, mx, my, mz
         plane[6] = POINT_SIGMA_M**2 + thin / n
-        plane[7] = thin / (n * values[1]) + _UNEVEN**2
+        # a few points may lie in a plane by chance: one of the usual noise counts beside them
+        plane[7] = (measured * n + POINT_SIGMA_M**2) / (n - 2.0) / (n * values[1]) + _UNEVEN**2
 
 
 @njit(allocates=False)
