@@ -299,14 +299,6 @@ ROBOTS = {
 }
 
 
-@pytest.mark.parametrize(
-    "change", [lambda _, r: np.clip(1.0 - r / 12.0, 0.0, 1.0), lambda _, r: 2.0 * np.sqrt(r)], ids=["0 to 1", "roots"]
-)
-def test_values_that_are_no_distances_are_named(tmp_path, change):
-    said, _ = outcome(save(tmp_path / "run.mcap", with_ranges(change)))
-    assert "not corrected" in said
-
-
 @pytest.mark.parametrize(("make", "line"), ROBOTS.values(), ids=ROBOTS)
 def test_a_robot(tmp_path, make, line):
     messages, error_m = outcome(save(tmp_path / "run.mcap", make()))

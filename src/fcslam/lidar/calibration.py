@@ -100,8 +100,6 @@ class MotionCalibration:
     """Correction of the pose of the laser, in ``base``: x and y in metres, heading in radians."""
     sweep_share: Estimate | None = None
     """True duration of a sweep per assumed duration."""
-    is_related: bool = True
-    """Whether the turns of the scans are those of the odometry at any scale."""
 
 
 def calibrate(motions: ScanMotions, odometry: OdometryTrack) -> MotionCalibration:
@@ -110,21 +108,18 @@ def calibrate(motions: ScanMotions, odometry: OdometryTrack) -> MotionCalibratio
     A short drive has the scales alone: their standard deviations say whether they mean anything.
     """
     pairs = _pairs(motions)
-    turns = int(np.count_nonzero(np.abs(_turn(motions, pairs)) > LEAST_TURN_RAD))
+    turns = np.count_nonzero(np.abs(_turn(motions, pairs)) > LEAST_TURN_RAD)
     delay, turn_scale = Estimate(0.0, 0.0), None
-    is_related = False
     if turns >= FEWEST_PAIRS:
         delay, turn_scale = _delay_and_scale(motions, odometry, pairs)
-        is_related = turn_scale.sigma <= LARGEST_SIGMA * abs(turn_scale.value)
-    is_related |= max(turns, _turns_of(odometry.at(motions.stamps)[:, 2])) < 2 * FEWEST_PAIRS
     if len(pairs) < FEWEST_PAIRS:
-        return MotionCalibration(turn_scale=turn_scale, is_related=is_related)
+        return MotionCalibration(turn_scale=turn_scale)
     begins, ends = motions.stamps[pairs.T] + delay.value
     moved = se2.between(odometry.at(begins), odometry.at(ends))
     seen = se2.between(*motions.T_local_base[pairs.T])
     scale, mounting, residual_m = _fit(moved, seen, moved[:, 2] * (1.0 if turn_scale is None else turn_scale.value))
     distance_scale = _distance_scale(scale, moved, seen)
-    scales = MotionCalibration(turn_scale=turn_scale, distance_scale=distance_scale, is_related=is_related)
+    scales = MotionCalibration(turn_scale=turn_scale, distance_scale=distance_scale)
     is_known = distance_scale.sigma <= LARGEST_SIGMA * distance_scale.value
     is_measure, is_long = is_known and residual_m <= LARGEST_RESIDUAL_M, len(pairs) >= FEWEST_MOTIONS
     if turns < FEWEST_MOTIONS or (is_long and not is_measure):
@@ -150,15 +145,6 @@ def _pairs(motions: ScanMotions) -> Pairs:
 
 def _turn(motions: ScanMotions, pairs: Pairs) -> FloatArray:
     return np.asarray(se2.wrap_angle(motions.T_local_base[pairs[:, 1], 2] - motions.T_local_base[pairs[:, 0], 2]))
-
-
-def _turns_of(headings: FloatArray) -> int:
-    """How often the heading changes by ``LEAST_TURN_RAD``."""
-    count, last = 0, headings[0]
-    for heading in headings:
-        if abs(heading - last) > LEAST_TURN_RAD:
-            count, last = count + 1, heading
-    return count
 
 
 def _delay_and_scale(motions: ScanMotions, odometry: OdometryTrack, pairs: Pairs) -> tuple[Estimate, Estimate]:

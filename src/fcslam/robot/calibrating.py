@@ -46,8 +46,6 @@ LARGEST_SCALE: Final = 2.0
 """Odometry that turns more or less than the scans by a larger factor measures something else."""
 LONGEST_PERIOD_S: Final = 0.12
 """Odometry that comes more seldom says nothing about delays: it is interpolated."""
-LONGEST_INTERVAL_S: Final = 0.25
-"""Scans that come more seldom are tracked less well without odometry."""
 LEAST_DELAY_S: Final = 0.02
 LEAST_YAW_RAD: Final = 0.005
 LEAST_OFFSET_M: Final = 0.02
@@ -184,12 +182,6 @@ def _calibrate_finely(bag: "RosBag", config: LidarConfig) -> Calibrated:
         by_scans = OdometryTrack(motions.stamps[known], _unwrapped(motions.T_local_base[known]))
         calibration = MotionCalibration(sweep_share=calibrate(motions, by_scans).sweep_share)
     scale = calibration.turn_scale
-    if not calibration.is_related and assumed_s <= LONGEST_INTERVAL_S and not _is_wrong(scale):
-        line = (
-            "the turns of the scans are not those of the odometry; check that the ranges are distances in metres, and "
-            "that both are of one robot; not corrected"
-        )
-        return Calibrated(calibration, BagCorrection(), (line,))
     if scale is not None and not 1.0 / LARGEST_SCALE < scale.value < LARGEST_SCALE:
         return Calibrated(calibration, BagCorrection(), tuple(_scale_lines(calibration, survey.lasers[0].beams)))
     if odometry is not None and odometry.period_s > LONGEST_PERIOD_S:
