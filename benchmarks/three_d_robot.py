@@ -10,9 +10,10 @@ bag, `<bag>.truth.tum` has the true pose at each turn of the LiDAR.
 
 The trajectory is that of the robot alone, before any cloud. Errors are those of the positions after one rigid
 alignment, which rotations fix, too. The CPU time is that of a turn, with reading the bag; the uplink is that of all
-packets.
+packets, and the memory that of the process at the end of the drive. `long-<seed>` takes ten minutes.
 """
 
+import os
 import time
 from dataclasses import replace
 from functools import partial
@@ -31,8 +32,10 @@ from fcslam.wire.packets import measure
 
 SENSORS = {"wheels, IMU": (True, True), "wheels": (True, False), "IMU": (False, True), "neither": (False, False)}
 DRIVES = "flat-7", "flat-202", "ramp-32", "ramp-101", "ramp-303", "ramp-404"
+LONG = ("long-66",)
 COLUMNS = {"drive": "", "turns": "", "sessions": "", "ATE (RMSE), m": ".4f", "in the plane, m": ".4f",
-           "max, m": ".3f", "rotation, deg": ".3f", "CPU, ms a turn": ".1f", "uplink, kB/s": ".1f"}  # fmt: skip
+           "max, m": ".3f", "rotation, deg": ".3f", "CPU, ms a turn": ".1f", "uplink, kB/s": ".1f",
+           "memory, MB": ".0f"}  # fmt: skip
 
 
 def main() -> None:
@@ -40,15 +43,17 @@ def main() -> None:
     parser.add_argument("bags", type=Path, help="folder of the bags")
     parser.add_argument("--drives", nargs="+", default=DRIVES)
     parser.add_argument("--sensors", nargs="+", choices=SENSORS, default=tuple(SENSORS))
+    parser.add_argument("--long", nargs="*", default=LONG, help="long drives, with wheels and an IMU")
     parser.add_argument("--kept", type=Path, help="file that keeps finished drives, so that an interrupted run goes on")
     chosen = parser.parse_args()
     kept, report = common.Kept(chosen.kept), common.Report(__file__, __doc__, chosen)
-    for sensors in chosen.sensors:
+    tables = [(f"Besides the LiDAR: {sensors}", chosen.drives, sensors) for sensors in chosen.sensors]
+    for title, drives, sensors in (*tables, ("Ten minutes, with wheels and an IMU", chosen.long, next(iter(SENSORS)))):
         rows = []
-        for drive in chosen.drives:
+        for drive in drives:
             rows += kept.rows((drive, sensors), partial(rows_of, chosen.bags / drive, sensors))
             print(sensors, *rows[-1], flush=True)
-        report.table(f"Besides the LiDAR: {sensors}", COLUMNS, rows)
+        report.table(title, COLUMNS, rows)
     report.write()
 
 
@@ -63,12 +68,13 @@ def rows_of(bag: Path, sensors: str) -> list[tuple[object, ...]]:
         packets += robot.process(kept)
     packets += robot.finish()
     cpu_s = time.process_time() - began
+    memory_mb = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
     stamps, poses = read_tum_6d(Path(f"{bag}.truth.tum"))
     track = max(robot.tracks, key=len)
     true = poses[np.abs(stamps[:, None] - track.stamps).argmin(axis=0)]
     uplink = sum(len(measure(packet).data) for packet in packets) / 1e3 / float(np.ptp(stamps))
     errors = errors_of(track.T_odom_base(), true)
-    return [(bag.name, len(stamps), len(robot.tracks), *errors, 1e3 * cpu_s / len(stamps), uplink)]
+    return [(bag.name, len(stamps), len(robot.tracks), *errors, 1e3 * cpu_s / len(stamps), uplink, memory_mb)]
 
 
 if __name__ == "__main__":
