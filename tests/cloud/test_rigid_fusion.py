@@ -46,6 +46,15 @@ def results(packets):
     }
 
 
+def test_the_maps_of_each_joined_pair_are_compared():
+    """Also of the pair whose join follows from two others."""
+    robots = small_fleet.draw(3, 30.0).robots
+    packets = small_fleet.in_order(packet for robot in robots for packet in small_fleet.sent_by(robot))
+    joins = feed(Cloud(FleetConfig(), seed=0), packets).finalize().joins
+    assert len(joins) == 3
+    assert all(evidence.fit is not None and evidence.fit.compared_m > 10.0 for evidence in joins.values())
+
+
 def test_clean_matches_put_every_robot_near_its_true_pose(results, drawn):
     """Rigid maps keep their drift, and a direction from two near points is a rough one: a decimetre over 30 m."""
     assert set(map_of(results[RIGID]).values()) == {0}

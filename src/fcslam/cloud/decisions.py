@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from typing import ClassVar
@@ -173,12 +174,22 @@ class ClosureDecisions(Kept):
             partial(self.comparison.fit, growth=1.0) if final else self.comparison.fit,
             self.comparison.at,
         )
+        if final:
+            joins = {pair: self._compared(pair, evidence, fusion) for pair, evidence in fusion.joins.items()}
+            fusion = replace(fusion, joins=joins)
         self.separated += _separated(self.maps, fusion.maps)
         self.maps, self.joins = [list(sessions) for sessions in fusion.maps], dict(fusion.joins)
         self._due.clear()
         self._joins, self._contested, self._evaluated = False, False, len(self.closures)
         self.version += 1
         return fusion
+
+    def _compared(self, pair: frozenset[str], evidence: ClusterEvidence, fusion: Fusion) -> ClusterEvidence:
+        """The evidence of a join with the fit of both maps, which was not needed if other joins decided."""
+        if evidence.fit is not None:
+            return evidence
+        a, b = sorted(pair)
+        return replace(evidence, fit=self.comparison.at((a, b), fusion.T_map_base[a], fusion.T_map_base[b]))
 
     def _mark(self, entry: ClosureEntry) -> bool:
         """Note whether users exclude or pin the closure; returns whether that is new."""
