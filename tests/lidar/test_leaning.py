@@ -54,6 +54,8 @@ def test_level_lasers_and_short_drives_tell_nothing():
     assert floor_line(SCANS) is None
     assert floor_line(leaning[:100]) is None
     assert floor_line([replace(scan, T_odom_base=frozen((math.nan,) * 3)) for scan in leaning]) is None
+    in_millimetres = [replace(scan, T_odom_base=frozen(scan.T_odom_base * (1e3, 1e3, 1.0))) for scan in SCANS]
+    assert floor_line(in_millimetres) is None, "every wall moves with the robot"
 
 
 def test_walls_at_one_distance_along_a_corridor_are_no_floor():

@@ -16,7 +16,14 @@ from typing import Final
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.lidar.facing import SCANS_WATCHED, Contradiction, contradicted_facing, part_agreement
+from fcslam.lidar.facing import (
+    AS_STATED,
+    LEAST_AGREEMENT,
+    SCANS_WATCHED,
+    Contradiction,
+    contradicted_facing,
+    part_agreement,
+)
 from fcslam.lidar.own_body import MOST_PLACES, by_degree, scans_apart
 from fcslam.lidar.scan import rays_of
 from fcslam.records import FloatArray, LaserScan, frozen
@@ -46,9 +53,17 @@ def wrong_laser(scans: Sequence[LaserScan]) -> FloorLine | Contradiction | None:
 
 
 def floor_line(scans: Sequence[LaserScan]) -> FloorLine | None:
-    """The line in which a laser sees the floor; None if it does not, or the drive does not tell."""
+    """The line in which a laser sees the floor; None if it does not, or the drive does not tell.
+
+    With odometry of another unit every wall moves with the robot, so the other returns must fit the odometry.
+    """
     line = _line_ahead(scans)
-    return line if line is not None and part_agreement(scans, partial(_at_line, line)) < MOVING else None
+    if line is None or not part_agreement(scans, partial(_at_line, line)) < MOVING:
+        return None
+    if part_agreement(scans, line.left_out) > LEAST_AGREEMENT:
+        return line
+    found = contradicted_facing(map(line.left_out, scans))
+    return line if found is not None and found.facing != AS_STATED else None
 
 
 def _at_line(line: FloorLine, scan: LaserScan) -> LaserScan:
