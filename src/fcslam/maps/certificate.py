@@ -14,7 +14,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from fcslam.geometry import se2
 from fcslam.geometry.groups import SE2
@@ -109,7 +108,7 @@ def certify(
         "drives": _drives(places, nearest, is_good, bar_m, within_m),
         "open_ends": [
             {"x": round(one.point[0], 2), "y": round(one.point[1], 2), "gain_m2": round(one.gain_m2, 1)}
-            for one in frontiers(occupancy, ends, robot_radius_m)
+            for one in frontiers(occupancy, ends, robot_radius_m, with_paths=False)
             if one.gain_m2 >= OPEN_M2
         ],
         "cells": cells,
@@ -130,25 +129,24 @@ def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
     turn = se2.adjoint(poses[chosen] * (0.0, 0.0, 1.0))
     covariance = np.einsum("pab,pbqc,qdc->paqd", turn, in_bases, turn, optimize=True).reshape(3 * len(chosen), -1)
     scale = QUIET + _contradiction(graph, rows, len(variables))
-    drift = _drift(part, poses)[chosen]
+    drift = _drift(part, poses, chosen)
     return Places(variables[chosen], poses[chosen], covariance * scale**2, scale, drift * scale**2)
 
 
-def _drift(edges: EdgeArrays, poses: FloatArray) -> FloatArray:
-    """Covariance that a metre of the path adds at each pose, along the axes of ``map``, shape (N, 3, 3).
+def _drift(edges: EdgeArrays, poses: FloatArray, chosen: NDArray[np.int64]) -> FloatArray:
+    """Covariance that a metre of the path adds at the chosen poses, along the axes of ``map``, shape (P, 3, 3).
 
-    It is the mean over the steps of the path within ``WITHIN_M``.
+    It is the mean over the steps of the path within ``WITHIN_M``, or that of the nearest step.
     """
     steps = np.flatnonzero((edges.j == edges.i + 1) & (np.hypot(*edges.T_i_j[:, :2].T) > 1e-3))
     if not len(steps):
-        return np.zeros((len(poses), 3, 3))
+        return np.zeros((len(chosen), 3, 3))
     turn = se2.adjoint(poses[edges.j[steps]] * (0.0, 0.0, 1.0))
     length_m = np.hypot(*edges.T_i_j[steps, :2].T)
     added = turn @ np.linalg.inv(edges.information[steps]) @ turn.swapaxes(1, 2) / length_m[:, None, None]
-    middles = cKDTree(poses[edges.j[steps], :2])
-    near = middles.query_ball_point(poses[:, :2], WITHIN_M)
-    nearest = np.asarray(middles.query(poses[:, :2])[1], np.int64)
-    return np.array([added[rows or [one]].mean(axis=0) for rows, one in zip(near, nearest, strict=True)])
+    apart_m = np.array([_distances(poses[edges.j[steps]], place) for place in poses[chosen]])
+    near = apart_m <= np.maximum(WITHIN_M, apart_m.min(axis=1, keepdims=True))
+    return np.asarray(near @ added.reshape(-1, 9) / near.sum(axis=1, keepdims=True)).reshape(-1, 3, 3)
 
 
 def _contradiction(graph: PoseGraph, rows: NDArray[np.int64], variables: int) -> float:
@@ -169,16 +167,16 @@ def bend_m(
     result = np.zeros(len(poses))
     if len(poses) < 3:
         return result
-    tree, blocks = cKDTree(poses[:, :2]), covariance.reshape(len(poses), 3, len(poses), 3)[:, :2, :, :2]
-    fewest = min(FEWEST_NEAR, len(poses))
-    reach_m = np.maximum(within_m, np.asarray(tree.query(poses[:, :2], fewest)[0])[:, -1])
+    farthest = min(FEWEST_NEAR, len(poses)) - 1
     for k in range(len(poses)) if wanted is None else wanted.tolist():
-        near = np.array(tree.query_ball_point(poses[k, :2], reach_m[k] * (1.0 + 1e-9)), np.int64)
+        apart_m = _distances(poses, poses[k])
+        near = np.flatnonzero(apart_m <= max(within_m, float(np.partition(apart_m, farthest)[farthest])))
         arms = poses[near, :2] - poses[near, :2].mean(axis=0)
         motions = np.concatenate((np.tile(np.eye(2), (len(near), 1)), (arms @ _S.T).reshape(-1, 1)), axis=1)
         motions /= np.maximum(np.linalg.norm(motions, axis=0), 1e-9)
-        around = blocks[near[:, None], :, near].transpose(0, 2, 1, 3).reshape(2 * len(near), -1)
-        rigid = np.einsum("ia,ij,ja->", motions, around, motions, optimize=True)
+        rows = (3 * near[:, None] + (0, 1)).ravel()
+        around = covariance[np.ix_(rows, rows)]
+        rigid = (motions * (around @ motions)).sum()
         result[k] = math.sqrt(max(0.0, float(np.trace(around) - rigid)) / len(near))
     return result
 

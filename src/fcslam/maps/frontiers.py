@@ -4,13 +4,10 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_opening, distance_transform_edt, find_objects, label, uniform_filter
-from scipy.optimize import linear_sum_assignment
-from scipy.sparse.csgraph import dijkstra
 
-from fcslam.geometry.cell_graph import cell_graph
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray
 
@@ -35,8 +32,7 @@ SHARING_M: Final = 4.0 * VIEW_M
 """Metres of path that a frontier costs more for each robot that goes there already."""
 UNREACHABLE: Final = 1e9
 """Cost of a frontier without a path, metres; more than any path."""
-NEIGHBOURS: Final = np.ones((3, 3), bool)
-MARGIN: Final = len(NEIGHBOURS)
+MARGIN: Final = 3
 """Unknown cells of the search grid on each side of the map."""
 
 Cells = NDArray[np.bool_]
@@ -54,32 +50,36 @@ class Frontier(NamedTuple):
     """Length of the shortest path from each robot; infinite if no path leads there."""
 
 
-def frontiers(occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float) -> list[Frontier]:
+def frontiers(
+    occupancy: OccupancyMap, robots_xy: FloatArray, radius_m: float, with_paths: bool = True
+) -> list[Frontier]:
     """The frontiers that one of the robots can reach, that with the largest gain first.
 
     ``robots_xy`` (R, 2) in metres, in the frame of the map. The centre of a robot stays ``radius_m`` from occupied
-    cells, and it passes no unknown cell.
+    cells, and it passes no unknown cell. Without paths, ``distances_m`` are empty.
     """
     free, occupied, side_m, origin = search_grid(occupancy)
     if not free.any():
         return []
     passable = passable_cells(free, occupied, side_m, radius_m)
-    unknown = binary_opening(~free & ~occupied, NEIGHBOURS)
-    parts, _ = label(free & _beside(unknown), NEIGHBOURS)
+    unknown = cv2.morphologyEx((~free & ~occupied).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, parts, boxes, _ = cv2.connectedComponentsWithStats((free & _beside(unknown > 0)).astype(np.uint8))
     window = max(1, round(VIEW_M / side_m))
-    gains_m2 = (window * side_m) ** 2 * uniform_filter(unknown.astype(np.float32), window, mode="nearest")
+    share = cv2.blur(unknown.astype(np.float32), (window, window), borderType=cv2.BORDER_REPLICATE)
+    gains_m2 = (window * side_m) ** 2 * share
     starts = start_cells(passable, robots_xy, side_m, origin)
-    areas, _ = label(passable, NEIGHBOURS)
+    _, areas = cv2.connectedComponents(passable.astype(np.uint8))
     reached = np.isin(areas, [areas[start] for start in starts if start is not None])
     points, sizes = [], []
-    for number, part in enumerate(find_objects(parts), 1):
-        cells = np.argwhere(parts[part] == number) + [edge.start for edge in part]
+    for number, (left, top, width, height, _) in enumerate(boxes[1:].tolist(), 1):
+        cells = np.array((top, left)) + np.argwhere(parts[top : top + height, left : left + width] == number)
         near = cells[reached[tuple(cells.T)]]
         if len(cells) * side_m >= 2.0 * radius_m and len(near):
             points.append(near[np.argmin(((near - cells.mean(axis=0)) ** 2).sum(axis=1))])
             sizes.append(len(cells) * side_m)
     at = tuple(np.array(points, np.int64).reshape(-1, 2).T)
-    ways = np.array([field[at] for field in path_lengths(passable, starts, side_m)]).reshape(len(starts), len(points))
+    fields = list(path_lengths(passable, starts, side_m)) if with_paths else []
+    ways = np.array([field[at] for field in fields]).reshape(len(fields), len(points))
     places = np.array(origin) + side_m * (np.stack(at[::-1], axis=-1) + 0.5)
     found = [
         Frontier((x, y), length_m, gain_m2, tuple(lengths))
@@ -107,6 +107,8 @@ class Explorer:
         The frontiers of the present map have a distance for each of the robots, in their order;
         positions in metres, in the frame of the map.
         """
+        from scipy.optimize import linear_sum_assignment  # it takes long to load, and a certificate does not need it
+
         for robot, at in robots.items():
             goal = self._goals.get(robot)
             if goal is not None and math.dist(goal, at) <= REACHED_M:
@@ -161,9 +163,9 @@ def _beside(cells: Cells) -> Cells:
 
 def passable_cells(free: Cells, occupied: Cells, side_m: float, radius_m: float) -> Cells:
     """Where the centre of a robot may be, without pockets between obstacles."""
-    clear_m = side_m * np.asarray(distance_transform_edt(~occupied))
-    areas, _ = label(free & (clear_m > radius_m), NEIGHBOURS)
-    is_wide = np.bincount(areas.ravel()) * side_m**2 >= POCKET_M2
+    clear_m = side_m * cv2.distanceTransform((~occupied).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    _, areas, boxes, _ = cv2.connectedComponentsWithStats((free & (clear_m > radius_m)).astype(np.uint8))
+    is_wide = boxes[:, cv2.CC_STAT_AREA] * side_m**2 >= POCKET_M2
     is_wide[0] = False
     return np.asarray(is_wide[areas])
 
@@ -174,11 +176,10 @@ def start_cells(
     """The passable cell nearest to each robot; None if that is too far away."""
     if not passable.any():
         return [None] * len(robots_xy)
-    nearest = np.asarray(distance_transform_edt(~passable, return_distances=False, return_indices=True))
+    cells = np.argwhere(passable)
     found: list[tuple[int, int] | None] = []
     for at in np.floor((robots_xy - origin) / side_m).astype(np.int64)[:, ::-1]:
-        row, column = np.clip(at, 0, np.array(passable.shape) - 1)
-        start = nearest[:, row, column]
+        start = cells[np.argmin(((cells - at) ** 2).sum(axis=1))]
         is_near = side_m * float(np.hypot(*(start - at))) <= SAME_M
         found.append((int(start[0]), int(start[1])) if is_near else None)
     return found
@@ -186,6 +187,10 @@ def start_cells(
 
 def path_lengths(passable: Cells, starts: Sequence[tuple[int, int] | None], side_m: float) -> Iterator[FloatArray]:
     """Length of the shortest path from each cell ``starts`` to all cells, shape (H, W) each; infinite without one."""
+    from scipy.sparse.csgraph import dijkstra  # SciPy takes long to load, and a certificate needs no paths
+
+    from fcslam.geometry.cell_graph import cell_graph
+
     numbers = np.cumsum(passable).reshape(passable.shape) - 1
     graph = cell_graph(passable, side_m, np.ones(passable.shape))
     for start in starts:
