@@ -34,7 +34,7 @@ from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
 from fcslam.wire.ledger import Ledger
-from fcslam.wire.messages import Packet
+from fcslam.wire.messages import Acknowledgement, Packet
 from fcslam.wire.packets import SizedPacket, measure
 
 _log = logging.getLogger(__name__)
@@ -134,7 +134,7 @@ def run_mission(
 
 
 class MissionCloud:
-    """The cloud of a mission within one process; it counts what is sent."""
+    """The cloud of a mission within one process; it counts what is sent, without acknowledgements."""
 
     def __init__(self, config: MissionConfig, inputs: MissionInputs = MissionInputs()) -> None:
         """Begin with the edits and the refused packets of an earlier mission; its other packets are still to come."""
@@ -156,7 +156,8 @@ class MissionCloud:
         except PacketError as error:
             raise FcslamError(f"{sent.packet.robot}: the cloud refused a packet: {error}") from error
         self._packets.append(as_stored(sent))
-        for packet in (sent, *map(measure, replies)):
+        news = (reply for reply in replies if not isinstance(reply.body, Acknowledgement))
+        for packet in (sent, *map(measure, news)):
             self._traffic.accept(packet.label, packet.size)
         return replies
 
