@@ -34,6 +34,14 @@ def test_of_a_large_log_only_the_end_is_read(log, tmp_path):
     assert [entry.content["number"] for entry in log.newest(3)] == [0, 1, 2]
 
 
+def test_a_torn_line_is_left_out_and_harms_no_other(log, tmp_path):
+    for number in range(3):
+        log.record("boss", "::1", "POST /x", 201, {"number": number})
+        with (tmp_path / "audit.jsonl").open("ab") as file:
+            file.write(b'{"time":"1970-01-01T')
+    assert [entry.content["number"] for entry in log.newest(10)] == [0, 1, 2]
+
+
 def test_what_cannot_be_written_is_said_and_stops_nothing(tmp_path, caplog):
     log = audit_file(tmp_path / "missing" / "audit.jsonl", lambda: 0.0)
     log.record("boss", "::1", "POST /x", 201, {})

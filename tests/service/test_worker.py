@@ -18,6 +18,7 @@ import pytest
 from fcslam.cloud.host import FleetHost
 from fcslam.cloud.replies import NEWS_M
 from fcslam.cloud.settings import CloudConfig, FleetConfig
+from fcslam.errors import StoreError
 from fcslam.geometry import se3
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.mission.mission_store import MissionStore, StoredPacket
@@ -26,6 +27,7 @@ from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
 from fcslam.service.joint_maps import read_joint_maps
 from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.shared.files import RESULT
 from fcslam.service.supervisor import PROGRESS
 from fcslam.service.worker import AT_ONCE, MOST_CRASHES, QUALITY_EVERY_S, SNAPSHOT_EVERY_S, CrashLog, Worker
 from fcslam.sources import open_source
@@ -65,9 +67,9 @@ class Cloud:
         self.now, self.told, self.tick = 0.0, [], 1.0
         self.restart()
 
-    def restart(self, make_host=FleetHost):
+    def restart(self, make_host=FleetHost, share=lambda *_: None):
         told = lambda *event: self.told.append(event)  # noqa: E731
-        self.worker = Worker(self.folder, self.store, self.clock, told, InlineTask, make_host=make_host)
+        self.worker = Worker(self.folder, self.store, self.clock, told, InlineTask, share=share, make_host=make_host)
 
     def clock(self):
         self.now += self.tick
@@ -592,6 +594,15 @@ def test_a_result_that_fails_stops_nothing(cloud):
     number = cloud.store.ask_to_finalize()
     cloud.work()
     assert cloud.store.finalization(number).failure == "a pose is not finite"
+
+    def share(name, _):
+        if name.startswith(RESULT):
+            raise StoreError("over 1 GB")
+
+    cloud.restart(share=share)
+    number = cloud.store.ask_to_finalize()
+    cloud.work()
+    assert cloud.store.finalization(number).failure == "over 1 GB"
     cloud.restart()
     assert len(cloud.finalize().trajectories) == 2
     assert cloud.folder.live.exists()

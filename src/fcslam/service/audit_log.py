@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -76,15 +77,22 @@ class AuditLog:
             self._refused, self._line_at = 0, self._wall_clock() + REFUSED_EVERY_S
 
     def newest(self, limit: int) -> list[AuditEntry]:
-        """At most so many newest entries, the oldest of them first."""
-        return [AuditEntry(**json.loads(line)) for line in self._lines(limit)]
+        """At most so many newest entries, the oldest of them first; a line that is torn is left out."""
+        entries: list[AuditEntry] = []
+        for line in self._lines(limit):
+            with suppress(ValueError, TypeError):
+                entries.append(AuditEntry(**json.loads(line)))
+        return entries
 
 
 def audit_file(path: Path, wall_clock: Callable[[], float] = time.time) -> AuditLog:
     """A log in a file that is written in one thread and may be read in any."""
 
     def append(line: bytes) -> None:
-        with open(path, "ab", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+        with open(path, "a+b", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+            if file.tell():
+                file.seek(-1, os.SEEK_END)
+                line = line if file.read() == b"\n" else b"\n" + line  # a full disk tore the last one
             file.write(line + b"\n")
 
     def lines(limit: int) -> list[bytes]:

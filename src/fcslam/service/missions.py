@@ -169,7 +169,7 @@ class Missions:
             return
         if not folder.store.exists():
             raise UnknownMissionError(name, self.names)
-        with closing(MissionStore(folder.store)) as store:
+        with closing(MissionStore(folder.store, is_checked=True)) as store:  # the export is checked
             store.export(path)
 
     def import_mission(self, name: str, path: Path) -> None:

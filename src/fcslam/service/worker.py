@@ -383,11 +383,11 @@ class Worker:
             result = self._result()
             self._run(result, self._store.traffic()).save(self._folder.run(name), force=True)
             self._concluded = (self._applied, self._newest_edit), result
+            self._share(RESULT + name, self._folder.run(name))
         except Exception as error:  # asked for again, it would fail at the next worker too, and nothing else go on
             _log.exception("result %s failed", name)
             self._store.answer(asked.number, None, str(error) or type(error).__name__)
         else:
-            self._share(RESULT + name, self._folder.run(name))
             self._store.answer(asked.number, name)
         self._crashes.end()
         self._joint_maps.shown = self._live.shown = -1
@@ -624,7 +624,7 @@ def _task() -> WorkerTask | None:
 def _mission(folder: MissionFolder, task: WorkerTask) -> Iterator[tuple[MissionStore, Share]]:
     """The mission of a file, or of a server to which the worker has a lease."""
     if task.store is None or task.lease is None:
-        yield MissionStore(folder.store), lambda *_: None
+        yield MissionStore(folder.store, is_checked=True), lambda *_: None  # by the service
         return
     with closing(Postgres(task.store, f"worker of {folder.name}")) as server:
         held = Lease(*task.lease)

@@ -14,10 +14,11 @@ from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.mission.mission_store import MissionStore
 from fcslam.service.audit_log import audit_table
 from fcslam.service.intake import AGENT_LEASE_S
+from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.shared.files import SharedDetectors
 from fcslam.service.shared.instance import GRACE_S, Instance, fair_part
 from fcslam.service.shared.mission_tables import Lease, MissionTables
-from fcslam.service.shared.missions import SharedAgents
+from fcslam.service.shared.missions import SharedAgents, SharedMission
 from fcslam.service.shared.registry import Registry
 from tests.mission.test_mission_store import packet
 from tests.waiting import wait_for
@@ -44,7 +45,7 @@ def wanted(registry, postgres, name):
     return number
 
 
-def instance(postgres, name, room=10, clock=time.monotonic, kind=Registry):
+def instance(postgres, name, room=10, clock=time.monotonic, kind=Registry, follow=lambda: None):
     workers = []
 
     def launch(mission, lease):
@@ -52,7 +53,7 @@ def instance(postgres, name, room=10, clock=time.monotonic, kind=Registry):
         return workers[-1]
 
     registry = kind(postgres, name, f"process of {name}", LONG_S)
-    return Instance(registry, name, room, launch, lambda *_: None, lambda: None, clock), workers
+    return Instance(registry, name, room, launch, lambda *_: None, follow, clock), workers
 
 
 LONG_S = 3600.0
@@ -175,6 +176,15 @@ def test_an_instance_takes_no_more_missions_than_it_has_room_for(registry, postg
     small.close()
 
 
+def test_an_instance_that_cannot_take_over_a_detector_takes_missions(registry, postgres):
+    wanted(registry, postgres, "m")
+    one, _ = instance(postgres, "one", follow=lambda: int("no network"))
+    with pytest.raises(ValueError, match="no network"):
+        one.step()
+    assert held(registry) == {"m": "one"}
+    one.close()
+
+
 def test_the_open_mission_has_a_worker_before_others(registry, postgres):
     numbers = {name: wanted(registry, postgres, name) for name in ("old", "open", "new")}
     registry.open(numbers["open"])
@@ -247,6 +257,24 @@ def test_another_agent_is_refused_by_every_instance(registry, postgres):
     here.hold("a", "x")
     assert there.silent_s("a") < 5.0
     assert there.silent_s("c") is None
+    here.end("a")
+    there.hold("a", "z")
+    with pytest.raises(InputError, match="another agent speaks for this robot"):
+        here.hold("a", "x")
+
+
+def test_joint_maps_that_nobody_shared_are_not_looked_for_at_each_request(registry, postgres, tmp_path):
+    asked, (one, _) = [], instance(postgres, "one")
+
+    class Empty:
+        def rows(self, *query):
+            asked.append(query)
+            return []
+
+    mission = SharedMission(7, MissionFolder(tmp_path), Empty(), None, None, one)
+    assert not any(mission.joint_maps.exists() for _ in range(20))
+    assert len(asked) < 20
+    one.close()
 
 
 def test_the_audit_log_has_the_lines_of_all_instances(registry, postgres):

@@ -119,11 +119,11 @@ class Instance:
             threading.Thread(target=self._held.pop(lease).stop, daemon=True).start()
         self._registry.let_rest()
         self.look()
-        self._follow()
         resting = {mission.number for mission in self.known.values() if not mission.is_wanted}
         for lease in [lease for lease in self._held if lease.mission in resting]:
             self._end(lease)
         self._spread()
+        self._follow()  # last: what it cannot take over stops nothing else
 
     def _spread(self) -> None:
         """Take missions without a worker, or give one up, until each instance has its part."""

@@ -61,6 +61,12 @@ class SharedAgents(Agents):
             self._confirmed[robot] = agent, now
         self.note(robot, agent)
 
+    def end(self, robot: str) -> None:
+        """Note that a robot ended: any agent may speak for it now, to every instance."""
+        super().end(robot)
+        self._confirmed.pop(robot, None)
+        self._server.rows("DELETE FROM agents WHERE robot = ? RETURNING 1", (robot,), self._schema)
+
     def silent_s(self, robot: str) -> float | None:
         """Seconds since the robot's last batch to this instance, or about that to another one; None: never."""
         here = super().silent_s(robot)
@@ -115,11 +121,12 @@ class SharedMission(OpenMission):
         copy = self.folder.path / _SEEN / JOINT
         with self._fetching:
             now_s = time.monotonic()
-            if now_s > self._joint_at_s and (content := fetched(self._server, self._number, JOINT)) is not None:
-                with translate_errors(copy):
-                    copy.parent.mkdir(parents=True, exist_ok=True)
-                    write_file(copy, content)
-                self._joint_at_s = now_s + _JOINT_LOOK_S
+            if now_s > self._joint_at_s:
+                content, self._joint_at_s = fetched(self._server, self._number, JOINT), now_s + _JOINT_LOOK_S
+                if content is not None:
+                    with translate_errors(copy):
+                        copy.parent.mkdir(parents=True, exist_ok=True)
+                        write_file(copy, content)
         return copy
 
     def result(self, name: str) -> Path | None:
