@@ -184,8 +184,8 @@ def test_names_that_are_no_file_names_are_refused(tmp_path, name):
 
 
 def test_what_is_no_run_folder_is_refused(tmp_path):
-    for path in (tmp_path, tmp_path / "missing"):
-        with pytest.raises(InputError, match="not a run folder"):
+    for path, said in ((tmp_path, "not a run folder"), (tmp_path / "missing", "no such folder")):
+        with pytest.raises(InputError, match=said):
             open_run(path)
 
 

@@ -46,7 +46,7 @@ def load(kind: type[SettingsType], path: Path, over: SettingsType | None = None)
     try:
         content = parse_yaml(read_text(path, most=MOST_TEXT_BYTES))
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot read the configuration ({error}); give a YAML file, or KEY=VALUE") from error
+        raise InputError(f"{path}: cannot read the configuration ({error}); give FILE, KEY=VALUE or `paper`") from error
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
     if content is None:

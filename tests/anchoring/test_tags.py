@@ -152,7 +152,7 @@ def test_a_wrong_size_is_named_and_no_tag_is_blamed_for_it(scale):
         ("tags: {1: {x: 0, y: north}}", "tags: 1: y: .*valid number"),
         ("tags: {1: {x: .nan, y: 0}}", "tags: 1: x: .*finite number"),
         ("tags: {1: {x: 0, y: 0, yaw: .inf}}", "tags: 1: yaw: .*finite number"),
-        ("tags: {1: {x: 0, y: 0", "not YAML"),
+        ("tags: {1: {x: 0, y: 0", "not valid YAML"),
     ],
 )
 def test_a_bad_file_of_tags_gets_one_line(tmp_path, text, reason):

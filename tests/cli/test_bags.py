@@ -8,7 +8,6 @@ import pytest
 from fcslam.cli import main
 from fcslam.runs import read_tum
 from fcslam.sources import open_source
-from tests.sources import carmen_text
 from tests.sources.bag_messages import drive, mounted, odom, save, text
 
 pytestmark = pytest.mark.slow
@@ -92,36 +91,7 @@ def test_a_bad_name_is_refused(tmp_path, bag, refused, name):
     assert "name" in refused("map", f"{name}={bag}", "-o", tmp_path / "out")
 
 
-def test_a_name_without_a_file(tmp_path, refused):
-    assert "none.bag: no such file" in refused("map", f"anna={tmp_path}/none.bag", "-o", tmp_path / "out")
-    assert "no such file" in refused("map", f"={tmp_path}/none.bag", "-o", tmp_path / "out")
-
-
 # Refusals
-
-
-@pytest.mark.parametrize("given", ["scan-topic=/scan", "odom-topic=/odom", "laser-pose=0,0,0"])
-def test_options_of_bags_go_with_bags_only(tmp_path, bag, refused, given):
-    log = carmen_text.save(tmp_path / "a.log", carmen_text.drive(40))
-    assert "a.log: a CARMEN log" in refused("map", bag, log, "--sensors", given, "-o", tmp_path / "out")
-    assert "a.log: a CARMEN log" in refused("record", log, "-o", tmp_path / "a.bag", "--sensors", given)
-
-
-@pytest.mark.parametrize(
-    ("given", "reason"),
-    [
-        (["scan=/scan"], "expected KEY=VALUE with a key of scan-topic, odom-topic"),
-        (["scan-topic="], "expected KEY=VALUE"),
-        (["odom-topic=/odom", "odom-topic=none"], "--sensors odom-topic: is given twice"),
-        (["laser-pose=1,2"], "is not a pose; give X,Y,THETA in metres"),
-        (["laser-pose=nan,0,0"], "is not a pose; give X,Y,THETA in metres"),
-        (["cloud-band=0.6,0.1"], "--sensors cloud-band=0.6,0.1: is not a band of heights"),
-        (["cloud-band=0.1,0.6,-1"], "is not a band of heights"),
-    ],
-)
-def test_a_key_of_the_sensors_that_is_none(tmp_path, bag, refused, given, reason):
-    options = [word for value in given for word in ("--sensors", value)]
-    assert reason in refused("map", bag, *options, "-o", tmp_path / "out")
 
 
 def test_bad_bags_leave_nothing(tmp_path, refused):

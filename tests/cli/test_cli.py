@@ -61,32 +61,6 @@ def test_relations_across_robots_with_the_parts_of_another_run(run_and_relations
     assert "1 of 2 relations across robots used" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["missing", "{relations}"], "missing: not a run folder"),
-        (["{run}", "missing"], "missing: cannot read the relations"),
-        (["{run}", "{run}"], "cannot read the relations"),
-        (["{run}", "{relations}", "--parts", "missing"], "missing: not a run folder"),
-        (["{run}", "{relations}", "--csv", "missing/table.csv"], "cannot be written"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(run_and_relations, refused, arguments, message):
-    names = dict(zip(("{run}", "{relations}"), run_and_relations, strict=True))
-    assert message in refused("evaluate", "relations", *(names.get(argument, argument) for argument in arguments))
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [["mapp"], ["--nonsense"], ["evaluate", "relations"], ["evaluate", "relations", "a", "b", "--nonsense"]],
-)
-def test_wrong_usage_is_exit_code_2_without_a_traceback(capsys, arguments):
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    assert error.strip()
-
-
 def test_a_full_disk_behind_stdout_is_one_line():
     command = [sys.executable, "-m", "fcslam.cli", "evaluate", "--help"]
     with Path("/dev/full").open("w", encoding="utf-8") as full:

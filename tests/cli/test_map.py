@@ -1,7 +1,6 @@
 """The real command: whole runs, and every bad input in one line with nothing left behind."""
 
 import csv
-import gzip
 import json
 
 import cv2
@@ -139,43 +138,6 @@ def test_a_recording_of_one_scan_is_a_run(tmp_path):
     assert maps_of(tmp_path / "run") == {"one": 0}
 
 
-# Faults that the user has to correct: exit code 2, one line, nothing at the output path
-
-
-def written(path, content):
-    path.write_bytes(content)
-    return path
-
-
-BAD_LOGS = {
-    "missing": (lambda at: at / "missing.clf", "no such file"),
-    "empty": (lambda at: written(at / "e.clf", b""), "is empty"),
-    "a folder": (lambda at: at, "is a folder"),
-    "a truncated archive": (
-        lambda at: written(at / "t.clf.gz", gzip.compress("\n".join(drive(500)).encode())[:-200]), "truncated"
-    ),
-    "a name too long": (lambda at: save(at / f"{'x' * 80}.log", drive(41)), "rename"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("make", "reason"), BAD_LOGS.values(), ids=BAD_LOGS)
-@pytest.mark.parametrize("first", [True, False])
-def test_a_bad_recording_is_refused(tmp_path, log, refused, make, reason, first):
-    bad = make(tmp_path)
-    both = (bad, log) if first else (log, bad)
-    assert reason in refused("map", *both, "--output", tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("content", ["fleet: {join_map: false}", "- 1\n- 2", "{", "\x00", None])
-def test_a_bad_configuration_is_refused(tmp_path, log, refused, content):
-    config = tmp_path / "config.yaml"
-    if content is not None:
-        config.write_text(content)
-    assert "config.yaml" in refused("map", log, "--config", config, "--output", tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_run_is_only_replaced_with_force(tmp_path, log, refused):
     run = tmp_path / "run"
     assert run_map(log, "--output", run) == 0
@@ -229,35 +191,3 @@ def test_ctrl_c_leaves_no_folder_and_the_old_run_alone(tmp_path, capsys, monkeyp
 )
 def test_floors_are_those_of_all_recordings_or_of_one(options, floors):
     assert mapping.floors_of(options, ["a", "b"]) == floors
-
-
-@pytest.mark.parametrize(
-    ("words", "reason"),
-    [
-        ("-c seed=-1", "--config: seed: Input should be greater than or equal to 0"),
-        ("-c fleet.join_map=false", "did you mean 'fleet.join_maps'?"),
-        ("-c fleet.join_maps=[", "--config fleet.join_maps: not valid YAML"),
-        ("-c seed", "seed: cannot read the configuration"),
-        ("-c fleet.start_sigma=[0.3]", "fleet.start_sigma.1: Field required"),
-        ("-c fleet.start_sigma=[0.3,-1]", "fleet.start_sigma.1: Input should be greater than 0"),
-        ("--start r=1,2", "--start r= '1,2' is not a pose; give X,Y,THETA"),
-        ("--start r=1,2,nan", "is not a pose"),
-        ("--start r", "--start r= '' is not a pose"),
-        ("--start r=0,0,0 --start r=1,0,0", "two starts"),
-        ("--start nobody=0,0,0", "a start names 'nobody', but the robots are"),
-        ("--floor 1 --floor 2", "all recordings can be on one floor only"),
-        ("--floor r=1 --floor r=2", "r can be on one floor only"),
-        ("--floor x=1", "a floor names 'x', but the robots are r"),
-        ("--floor r=", "floor '' is not 1 to 16 of"),
-        ("--floor r@1=1 --floor r@1=2", "r@1 can be on one floor only"),
-        ("--floor r@soon=1", "expected NAME@TIME with seconds after the first scan, such as anna@44"),
-        ("--floor r@0=1", "expected NAME@TIME"),
-        ("--floor r@1e9=1", "a floor begins 1e+09 s after the first scan, but r has"),
-        ("--floor a\x1b[2J", "is not 1 to 16 of"),
-        ("--split 41", "cannot be cut into 41 parts"),
-    ],
-)
-def test_options_that_cannot_be_are_one_line(tmp_path, refused, words, reason):
-    log = save(tmp_path / "r.clf", drive(40))
-    assert reason in refused("map", log, *words.split(), "--output", tmp_path / "run")
-    assert not (tmp_path / "run").exists()

@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import ssl
 import stat
 import subprocess
@@ -102,16 +101,11 @@ def test_tokens_that_are_all_there_are_not_written_again(tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        (["--host", "0.0.0.0"], "--credentials"),
         (["--credentials", 300 * "x"], "holds neither tokens.yaml nor cloud.pem"),
-        (["--host", "::"], "--insecure"),
-        (["--credentials", "nowhere"], "holds neither tokens.yaml nor cloud.pem"),
         (["--credentials", "half"], "belong together"),
         (["--credentials", "bad"], "cloud.pem"),
         (["--client-ca", "ca.pem"], "--credentials with cloud.pem"),
         (["--credentials", "tokens"], "tokens.yaml"),
-        (["--config", "no.yaml"], "no.yaml"),
-        (["--host", "256.1.1.1", "--insecure"], "256.1.1.1"),
     ],
 )
 def test_a_service_that_cannot_run_as_told_says_so_in_one_line(tmp_path, wrong, says, refused, monkeypatch):
@@ -133,11 +127,6 @@ def test_an_encrypted_key_is_told_and_no_passphrase_asked_for(credentials, tmp_p
     assert "encrypted" in line
     with pytest.raises(CloudError, match="encrypted"):
         HttpTransport("https://cloud.test", "robot_1", "agent", Credentials(own=(credentials / "cloud.pem", sealed)))
-
-
-def test_a_port_that_is_taken_is_told(tmp_path, refused):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        assert "--port" in refused("serve", "--data", tmp_path / "data", "--port", taken.getsockname()[1])
 
 
 class Service:

@@ -56,7 +56,7 @@ def read_plan(path: Path, scale: float | None = None) -> BuildingPlan:
             case _:
                 plan, unit_m = _drawn_plan(path, scale), scale
     except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror or error})") from error
+        raise SourceError(f"{path}: cannot be read ({error.strerror or error}); give the file of a plan") from error
     height, width = plan.cells.shape
     if max(height, width) * plan.resolution_m > WIDEST_M:
         raise SourceError(
@@ -80,11 +80,11 @@ def _ros_plan(path: Path, scale: float | None) -> OccupancyMap:
 
 
 def _drawn_plan(path: Path, scale: float | None) -> OccupancyMap:
-    if scale is None:
-        raise SourceError(f"{path}: a picture has no scale; give metres per pixel, as in --plan-scale 0.02")
     pixels = decoded_image(read_bytes(path))
     if pixels is None:
         raise SourceError(f"{path}: cannot be read as a picture; save the plan as PNG, DXF or a ROS map (YAML)")
+    if scale is None:
+        raise SourceError(f"{path}: a picture has no scale; give metres per pixel, as in --plan-scale 0.02")
     if pixels.shape[0] * pixels.shape[1] > MOST_PIXELS:
         raise SourceError(f"{path}: has {pixels.shape[1]} x {pixels.shape[0]} pixels; make it smaller or crop it")
     cells = np.where(_lines(_colours(pixels)), Occupancy.OCCUPIED, Occupancy.FREE).astype(np.uint8)

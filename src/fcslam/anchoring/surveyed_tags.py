@@ -65,8 +65,8 @@ def read_survey(path: Path) -> Survey:
         raise SourceError(
             f"{path}: {where}{one_line(first['msg'])}; write tags: {{7: {{x: 1.5, y: 0.2, yaw: 1.571}}}}"
         ) from error
-    except ValueError as error:
-        raise SourceError(f"{path}: not YAML: {error}") from error
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{path}: cannot be read ({error}); give a YAML file of surveyed tags") from error
     return {Tag(content.family, number): (at.x, at.y, at.yaw) for number, at in content.tags.items()}
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.inputs import bag_options
+from fcslam.cli.inputs import bag_options, named_path
 from fcslam.cli.options import Sensors
 from fcslam.cli.output import notices
 from fcslam.errors import printable
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def info(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording in any known format.")],
+    recording: Annotated[str, typer.Argument(metavar="RECORDING", help="Recording in any known format.")],
     *,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     calibrate: Annotated[
@@ -38,7 +38,7 @@ def info(
     from fcslam.sources.inspection import inspect
 
     options = bag_options(sensors)
-    found = _with_contradictions(inspect(recording, options), options)
+    found = _with_contradictions(inspect(named_path(recording)[0], options), options)
     if as_json:
         typer.echo(json.dumps(asdict(found), default=str, indent=2, allow_nan=False))
     else:

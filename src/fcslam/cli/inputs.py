@@ -84,6 +84,8 @@ def named_path(argument: str) -> tuple[Path, str | None]:
     A path that is not there is refused here, before code is loaded and compiled to read it.
     """
     name, equals, path = argument.partition("=")
+    if is_live(argument):
+        raise InputError(f"{argument}: is a live robot, not a recording; `fcslam robot {argument}` maps it")
     # Path.exists raises for a name that is too long, and in a folder that cannot be searched.
     if not equals or not name or os.path.exists(argument):
         name, path = "", argument
@@ -97,6 +99,11 @@ def named_path(argument: str) -> tuple[Path, str | None]:
                 raise InputError(f"{file}: no such file; check the path of the recording") from None
             except OSError as error:
                 raise InputError(f"{file}: cannot be read ({error}); check the path of the recording") from error
+    from fcslam.runs.folder import MISSION
+
+    if os.path.exists(os.path.join(path, MISSION)) or os.path.basename(path) == MISSION:
+        run = path.removesuffix(MISSION).rstrip(os.sep) or "."
+        raise InputError(f"{path}: is a run, not a recording; `fcslam map --onto {run}` continues it")
     return Path(path), name or None
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.inputs import is_live, open_recording, print_faults
+from fcslam.cli.inputs import open_recording, print_faults
 from fcslam.cli.options import (
     STATE,
     Budget,
@@ -78,8 +78,6 @@ def play(
     from fcslam.storage.files import keep_private
 
     keep_private()
-    if is_live(recording):
-        raise InputError(f"{recording}: is a live robot; `fcslam robot {recording}` maps it")
     settings, cloud = mission_config(config, in_space=in_space), access(server, credentials, budget_kBps)
     if cloud is None:
         raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")

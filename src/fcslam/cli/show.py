@@ -49,7 +49,7 @@ def show(
             try:
                 write_file(html, content)
             except OSError as error:
-                raise InputError(f"{html}: cannot be written ({error})") from error
+                raise InputError(f"{html}: cannot be written ({error}); choose another place") from error
             typer.echo(f"report of {run}: {html} ({len(content) / 1e6:.1f} MB)")
             return
         from fcslam.page.routes import run_page, serve_page

@@ -74,7 +74,7 @@ def check_undo(edits: Sequence[Edit], number: int) -> None:
     """Check that edit ``number`` can be undone."""
     named = next((edit for edit in edits if edit.number == number), None)
     if named is None:
-        raise InputError(f"there is no edit {number}; there are {len(edits)}")
+        raise InputError(f"there is no edit {number}; `fcslam edit list` shows all {len(edits)}")
     if isinstance(named.content, Undo):
         raise InputError(f"edit {number} undoes edit {named.content.number}; make that edit again instead")
     if number in (gone := undone(edits)):

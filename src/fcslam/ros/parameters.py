@@ -35,7 +35,7 @@ def load_parameters(path: Path | None) -> NodeParameters:
     try:
         content: Any = parse_yaml(read_text(path, most=MOST_TEXT_BYTES))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({one_line(str(error))})") from error
+        raise InputError(f"{path}: cannot be read ({one_line(str(error))}); give a YAML file") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: has no parameters; write `fcslam: {{ros__parameters: {{...}}}}`")
     nodes = [node[_PARAMETERS] for node in content.values() if isinstance(node, dict) and _PARAMETERS in node]

@@ -111,7 +111,7 @@ class Run(RunTables):
             with replacing_folder(place) as staging:
                 _write(self, staging)
         except OSError as error:
-            raise InputError(f"{place}: cannot write the run ({error})") from error
+            raise InputError(f"{place}: cannot write the run ({error}); name another folder") from error
 
 
 def prepare_output(path: Path, force: bool = False) -> Path:
@@ -166,6 +166,8 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
         maps: read the maps, the pose graph and the mission file too, which may be large.
     """
     path = Path(folder)
+    if not path.exists():
+        raise InputError(f"{path}: no such folder; check the path of the run")
     if not is_run_folder(path):
         raise InputError(f"{path}: not a run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one")
     try:

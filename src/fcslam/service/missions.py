@@ -11,6 +11,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import InputError, StoreError
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Change, Edit, Undo
+from fcslam.runs.folder import is_run_folder
 from fcslam.service.detectors import STAGING, DetectorStore
 from fcslam.service.intake import Intake, SessionState
 from fcslam.service.mission_folder import MissionFolder
@@ -238,6 +239,8 @@ def sweep(root: Path) -> None:
 
 def locked(root: Path) -> IO[str]:
     """The folder's lock file, held until it is closed."""
+    if is_run_folder(root):
+        raise InputError(f"{root}: is a run, which `fcslam show {root}` shows; name a folder for missions")
     try:
         root.mkdir(parents=True, exist_ok=True)
         file = (root / "lock").open("w")

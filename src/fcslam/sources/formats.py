@@ -156,6 +156,8 @@ def format_of(path: Path) -> str:
                 raise SourceError(f"{part}: a {LOG} is not a part of several; give one recording, or parts of a bag")
         return BAG
     content = b"" if is_folder(path) else head(path)
+    if content.startswith(b"PK\x03\x04"):
+        raise SourceError(f"{path}: is a zip archive; unpack it, and give the recording in it")
     if is_carmen(content):
         return LOG
     with translate_errors(path):

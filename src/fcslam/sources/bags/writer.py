@@ -86,7 +86,7 @@ def _opened(path: Path) -> Iterator["_Bag"]:
     from rosbags import rosbag1, rosbag2
 
     if path.suffix not in BAG_SUFFIXES:
-        raise InputError(f"{path}: not a kind of bag; end it in .bag, .mcap or .db3, or in nothing for a folder")
+        raise InputError(f"{path.name}: not a kind of bag; end it in .bag, .mcap or .db3, or in nothing for a folder")
     if path.suffix == _SQLITE and set("?#%") & set(str(path.absolute())):
         # rosbags puts the path into a URI as it is
         raise InputError(f"{path}: no .db3 can be written where a path holds ?, # or %; choose another path")
