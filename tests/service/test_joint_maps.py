@@ -1,9 +1,18 @@
 """Who explores which frontier of the joint maps, as the service says it."""
 
+import asyncio
+import time
+from types import SimpleNamespace
+
+import httpx
 import numpy as np
+from fastapi import FastAPI
 
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
-from fcslam.service.joint_maps import JointMaps, JointSession, ServedJointMaps
+from fcslam.service.http.joint_maps import joint_map_router
+from fcslam.service.joint_maps import JointMaps, JointSession, ServedJointMaps, write_joint_maps
+from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.missions import OpenMission
 
 
 def room(open_side):
@@ -44,3 +53,27 @@ def test_frontiers_are_kept_for_some_seconds():
     first, second, later = (served.explorations(maps, now_s)[0] for now_s in (1000.0, 1004.0, 1100.0))
     assert first is second
     assert later is not first
+
+
+def test_missions_that_are_asked_in_turn_keep_their_own_poses(tmp_path):
+    missions = [OpenMission(MissionFolder(tmp_path / name), None, None, None, time.time) for name in "xy"]
+    for mission in missions:
+        mission.folder.path.mkdir()
+        write_joint_maps(mission.joint_maps, JointMaps([session("a", 0)], {0: A}, {0: "frame"}, 0.2))
+    state = SimpleNamespace(mission=missions[0], require=lambda *_: [])
+    app = FastAPI()
+    app.include_router(joint_map_router(state))
+
+    def pose_of_a(robot, **own):
+        async def exchange():
+            async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost") as client:
+                return await client.post(f"/robots/{robot}/fleet", json=own)
+
+        (pose,) = (one["pose"] for one in asyncio.run(exchange()).json()["robots"])
+        return pose
+
+    assert pose_of_a("a", map=0, pose=(2.5, 2.0, 0.0)) == [2.5, 2.0, 0.0]
+    state.mission = missions[1]
+    assert pose_of_a("b") == [2.0, 2.0, 0.0]
+    state.mission = missions[0]
+    assert pose_of_a("b") == [2.5, 2.0, 0.0]

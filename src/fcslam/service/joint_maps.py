@@ -128,7 +128,7 @@ lacks robots that can reach none."""
 
 
 class ServedJointMaps:
-    """The joint maps of the open mission for robots: tiles that changed, and live poses. Any thread may call."""
+    """The joint maps of a mission for its robots: tiles that changed, and live poses. Any thread may call."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

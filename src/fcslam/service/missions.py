@@ -14,6 +14,7 @@ from fcslam.records import Change, Edit, Undo
 from fcslam.runs.folder import is_run_folder
 from fcslam.service.detectors import STAGING, DetectorStore
 from fcslam.service.intake import Intake, SessionState
+from fcslam.service.joint_maps import ServedJointMaps
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import RunningWorker
 from fcslam.service.viewed_mission import PacketCounts
@@ -46,6 +47,7 @@ class OpenMission:
     ) -> None:
         self.folder, self.store, self.intake = folder, store, intake
         self._worker, self._wall_clock = worker, wall_clock
+        self.served_maps = ServedJointMaps()
 
     @property
     def worker(self) -> RunningWorker:
@@ -96,6 +98,12 @@ class OpenMission:
         edit = self.store.edit(content, author, self._wall_clock())
         self.worker.notify()
         return edit
+
+    def ask_to_finalize(self) -> int:
+        """Request the result of all packets that arrived; returns the number of the request."""
+        number = self.store.ask_to_finalize()
+        self.worker.notify()
+        return number
 
     def close(self) -> None:
         """Stop the worker, then close the store."""

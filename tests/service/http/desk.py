@@ -55,6 +55,8 @@ class InlineWorker:
         self._now = 0.0
         self._store = MissionStore(folder.store)
         self.applied = 0
+        self._working, self.notified_by = threading.Lock(), set[int]()
+        """Threads that notified it."""
         self._worker = Worker(folder, self._store, lambda: self._now, self._note, InlineTask)
 
     def _note(self, event: str, content: int) -> None:
@@ -62,9 +64,11 @@ class InlineWorker:
             self.applied = content
 
     def notify(self) -> None:
-        self._now += 1000.0
-        while self._worker.step():
-            self._now += 1.0
+        self.notified_by.add(threading.get_ident())
+        with self._working:
+            self._now += 1000.0
+            while self._worker.step():
+                self._now += 1.0
 
     def stop(self) -> None:
         self._store.close()
@@ -92,21 +96,21 @@ class Desk:
         self.app = create_app(self.state)
         self._listening = socket.create_server(("127.0.0.1", 0))
         self._server = uvicorn.Server(uvicorn.Config(self.app, log_level="critical", ws="none", **options))
-        self._thread = threading.Thread(target=self._server.run, kwargs={"sockets": [self._listening]})
+        self.serving = threading.Thread(target=self._server.run, kwargs={"sockets": [self._listening]})
         port = self._listening.getsockname()[1]
         self.client = httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0)
 
     def __enter__(self) -> "Desk":
-        self._thread.start()
+        self.serving.start()
         while not self._server.started:
-            assert self._thread.is_alive()
+            assert self.serving.is_alive()
             time.sleep(0.01)
         return self
 
     def __exit__(self, *error: object) -> None:
         self.client.close()
         self._server.should_exit = True
-        self._thread.join()
+        self.serving.join()
         self._listening.close()
 
     def ask(self, method, path, as_=None, headers=None, **more):

@@ -29,6 +29,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[3]
 
 API = "/api/v1"
+SUFFIXES = "png", "pgm", "yaml", "svg", "zip"
 PACKETS = f"{API}/robots/a/packets"
 
 
@@ -69,6 +70,11 @@ def test_a_robot_hears_what_is_stored_and_where_it_is(mapped):
         "refused": [],
     }  # fmt: skip
     assert mapped.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": len(A)}
+
+
+def test_nothing_that_may_wait_for_a_store_runs_between_the_requests(mapped):
+    assert mapped.ask("POST", f"{API}/finalize", "boss").status_code == 200
+    assert mapped.serving.ident not in mapped.state.mission.worker.notified_by
 
 
 def test_a_robot_that_is_not_known_has_nothing_stored(desk):
@@ -181,7 +187,10 @@ def test_viewers_get_the_files_of_the_live_run(shown):
         assert shown.ask("GET", f"{API}/{path}", "eye").status_code in (400, 404)
 
 
-@pytest.mark.parametrize("path", ["maps/0/tiles/5/0/0.png", "maps/0/layers/changes", "closures"])
+@pytest.mark.parametrize(
+    "path",
+    ["maps/0/tiles/5/0/0.png", "maps/0/layers/changes", "closures", *(f"maps/0.{end}" for end in SUFFIXES)],
+)
 def test_what_did_not_change_is_not_sent_again(shown, path):
     path = f"{API}/{path}"
     first = shown.ask("GET", path, "eye")

@@ -45,9 +45,8 @@ def administration_router(state: ServiceState) -> APIRouter:
     @router.post("/finalize", responses=refusals(500))
     async def finalize() -> Finalized:
         """Write the result of all packets that arrived as a run folder of the service; the response waits for it."""
-        mission = state.mission
-        number = await run_in_threadpool(mission.store.ask_to_finalize)
-        mission.worker.notify()
+        mission = await run_in_threadpool(lambda: state.mission)
+        number = await run_in_threadpool(mission.ask_to_finalize)
         while not state.closing and mission is state.mission:
             asked = await run_in_threadpool(mission.store.finalization, number)
             if asked.failure:

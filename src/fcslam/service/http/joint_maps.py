@@ -25,7 +25,7 @@ from fcslam.service.http.limits import json_body, read_json
 from fcslam.service.http.responses import file_of, refusals, unless_known
 from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
-from fcslam.service.joint_maps import Exploration, ServedJointMaps
+from fcslam.service.joint_maps import Exploration, JointMaps, ServedJointMaps
 from fcslam.service.viewed_mission import run_of, viewed_run
 from fcslam.untrusted import read_bytes
 from fcslam.wire.fleet_replies import FleetReply, FrontierReply, MapFrontiers, QualityReply, TeammatePose
@@ -56,7 +56,10 @@ def joint_map_router(state: ServiceState) -> APIRouter:
     """The joint map that a robot belongs to, and the other robots."""
     router = APIRouter(tags=["robots"], responses=refusals(400, 401, 403, 503))
     as_reader = state.require(*Role)
-    joint = ServedJointMaps()
+
+    def followed() -> tuple[ServedJointMaps, JointMaps]:
+        mission = state.mission
+        return mission.served_maps, mission.served_maps.follow(mission.joint_maps)
 
     @router.post(
         "/robots/{robot}/fleet",
@@ -70,7 +73,7 @@ def joint_map_router(state: ServiceState) -> APIRouter:
 
     def exchange(robot: str, own: OwnPose) -> FleetReply:
         now_s = time.time()
-        maps = joint.follow(state.mission.joint_maps)
+        joint, maps = followed()
         if own.map is not None and own.pose is not None:
             joint.say(robot, own.map, own.pose, now_s)
         robots = []
@@ -95,7 +98,7 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         known: Annotated[str, Header(alias="If-None-Match", max_length=64)] = "",
     ) -> Response:
         """The tiles of the map that a robot is in, changed since those whose ETag it sends; at most ``limit`` bytes."""
-        maps = joint.follow(state.mission.joint_maps)
+        joint, maps = followed()
         number = next((session.map for session in maps.sessions if session.robot == robot), None)
         frame, _, text = known.strip('"').partition("-")
         version = int(text) if text.isascii() and text.isdigit() else 0
@@ -131,7 +134,7 @@ def joint_map_router(state: ServiceState) -> APIRouter:
 
         With ``robot``, only the map that this robot is in, and only its distances.
         """
-        maps = joint.follow(state.mission.joint_maps)
+        joint, maps = followed()
         explored = joint.explorations(maps, time.time())
         of_robot = {one.map for one in maps.sessions if robot in (None, one.robot)}
         return [

@@ -108,14 +108,13 @@ def map_router(state: ViewerState) -> APIRouter:
         """A map: picture, occupancy, what map_server needs to know of it, both in one archive, drawing, GeoTIFF if its
         place on earth is known, and points in space if robots with 3D LiDARs made it.
         """
-        if suffix == "ply":
-            return unless_known(request, read_bytes(_existing(state, f"{map_stem(k)}.ply")), MEDIA[suffix])
-        if suffix not in ("svg", "tif", "zip"):
-            return FileResponse(_existing(state, f"{map_stem(k)}.{suffix}"), media_type=MEDIA[suffix])
-        exported = export_map(_folder_of(state), k, suffix)
-        if exported is None:
+        if suffix in ("svg", "tif", "zip"):
+            content = export_map(_folder_of(state), k, suffix)
+        else:
+            content = read_bytes(_existing(state, f"{map_stem(k)}.{suffix}"))
+        if content is None:
             raise HTTPException(404, f"there is no {map_stem(k)}, or its place on earth is not known")
-        return Response(exported, media_type=MEDIA[suffix])
+        return unless_known(request, content, MEDIA[suffix])
 
     @router.get("/maps/{k}/tiles/{z}/{x}/{y}.png", **file_of(MEDIA["png"], refused=(400, 404), is_tagged=True))
     def get_tile(
@@ -138,16 +137,15 @@ def map_router(state: ViewerState) -> APIRouter:
     async def get_layer(request: Request, k: Index, layer: MapLayer) -> Response:
         """What is drawn over a map: floor plan and deviations, changes since the first day, tags, certificate."""
         async with turn:
-            shapes = await run_in_threadpool(map_shapes, state.mission, k, layer)
-            return unless_known(request, _SHAPES.dump_json(shapes), JSON)
+            content = await run_in_threadpool(lambda: _SHAPES.dump_json(map_shapes(state.mission, k, layer)))
+        return unless_known(request, content, JSON)
 
     @router.get("/maps/{k}/walls", responses=refusals(400, 404))
     async def get_walls(k: Index) -> dict[str, float]:
         """The direction of most walls of a map: ``direction_rad``, from the x axis, in [-pi/4, pi/4)."""
-        image = _existing(state, f"{map_stem(k)}.pgm")
         try:
             async with turn:
-                return await run_in_threadpool(walls_of, image.parent, k)
+                return await run_in_threadpool(lambda: walls_of(_existing(state, f"{map_stem(k)}.pgm").parent, k))
         except InputError as error:
             raise HTTPException(404, str(error)) from error
 
@@ -162,7 +160,8 @@ def map_router(state: ViewerState) -> APIRouter:
     async def get_trajectories() -> Response:
         """The poses of all sessions, a file each."""
         async with turn:
-            return Response(await run_in_threadpool(_archive, _folder_of(state)), media_type=MEDIA["zip"])
+            content = await run_in_threadpool(lambda: _archive(_folder_of(state)))
+        return Response(content, media_type=MEDIA["zip"])
 
     @router.get("/trajectories/{session}.tum", **file_of(TEXT, refused=(400, 404)))
     def get_trajectory(

@@ -48,7 +48,12 @@ def mission_router(state: ServiceState) -> APIRouter:
     @router.get("/missions", dependencies=state.require(Role.VIEWER, Role.ADMIN))
     def list_missions() -> MissionList:
         """All missions, and which one is open."""
-        return _missions(state)
+        return MissionList(open=state.mission.folder.name, missions=state.missions.names)
+
+    def change(work: Callable[..., None], *arguments: object) -> MissionList:
+        with state.changing:
+            work(*arguments)
+        return list_missions()
 
     @router.post(
         "/missions",
@@ -60,16 +65,12 @@ def mission_router(state: ServiceState) -> APIRouter:
     async def create_mission(request: Request) -> MissionList:
         """Create a mission and open it."""
         mission = await read_json(request, NewMission)
-        async with state.changing:
-            await run_in_threadpool(state.missions.create, mission.name)
-        return _missions(state)
+        return await run_in_threadpool(change, state.missions.create, mission.name)
 
     @router.post("/missions/{name}/open", dependencies=as_admin, responses=refusals(400, 404, 507))
-    async def open_mission(name: Name) -> MissionList:
+    def open_mission(name: Name) -> MissionList:
         """Open a mission; robots' packets go to it from now on."""
-        async with state.changing:
-            await run_in_threadpool(state.missions.open, name)
-        return _missions(state)
+        return change(state.missions.open, name)
 
     @router.post(
         "/missions/import",
@@ -87,22 +88,20 @@ def mission_router(state: ServiceState) -> APIRouter:
                 await run_in_threadpool(check_mission, path)
             except StoreError as error:
                 raise HTTPException(400, f"the body is not an exported mission ({error})") from error
-            async with state.changing:
-                await run_in_threadpool(state.missions.import_mission, name, path)
-        return _missions(state)
+            return await run_in_threadpool(change, state.missions.import_mission, name, path)
 
     @router.get("/missions/{name}/export", dependencies=as_admin, **file_of(FILE, refused=(400, 404, 507)))
-    async def export_mission(name: Name) -> FileResponse:
+    def export_mission(name: Name) -> FileResponse:
         """A mission as one file."""
-        return await _download(state, f"{name}.sqlite", FILE, lambda path: state.missions.export(name, path))
+        return _download(state, f"{name}.sqlite", FILE, lambda path: state.missions.export(name, path))
 
     @router.get("/missions/{name}/runs/{number}.zip", dependencies=as_admin, **file_of(ZIP, refused=(400, 404, 507)))
-    async def download_run(name: Name, number: RunNumber) -> FileResponse:
+    def download_run(name: Name, number: RunNumber) -> FileResponse:
         """A result as one file: the run folder in a ZIP archive."""
         run = state.missions.result(name, number) if name in state.missions.names else None
         if run is None:
             raise HTTPException(404, f"mission '{name}' has no result {number}; POST /finalize makes one")
-        return await _download(state, f"{name}-{number}.zip", ZIP, lambda path: _pack(run, path))
+        return _download(state, f"{name}-{number}.zip", ZIP, lambda path: _pack(run, path))
 
     return router
 
@@ -113,20 +112,16 @@ def _pack(folder: Path, archive: Path) -> None:
         shutil.make_archive(str(archive.with_suffix("")), "zip", folder)
 
 
-async def _download(state: ServiceState, name: str, media_type: str, write: Callable[[Path], None]) -> FileResponse:
+def _download(state: ServiceState, name: str, media_type: str, write: Callable[[Path], None]) -> FileResponse:
     """Send a file that ``write`` makes in a folder of its own, which is removed afterwards."""
     folder = tempfile.TemporaryDirectory(dir=state.missions.root, prefix=EXPORT)
     path = Path(folder.name) / name
     try:
-        await run_in_threadpool(write, path)
+        write(path)
     except BaseException:
         folder.cleanup()
         raise
     return FileResponse(path, media_type=media_type, filename=name, background=BackgroundTask(folder.cleanup))
-
-
-def _missions(state: ServiceState) -> MissionList:
-    return MissionList(open=state.mission.folder.name, missions=state.missions.names)
 
 
 async def _receive(request: Request, path: Path) -> None:

@@ -66,11 +66,16 @@ def robot_router(state: ServiceState) -> APIRouter:
     ) -> Response:
         """Store a batch of packets; the response acknowledges what is on disk."""
         body = await read_body(request, MAXIMUM_BATCH_BYTES)
-        mission = state.mission
-        reply, refused, removed = await run_in_threadpool(mission.intake.take, robot, agent, body, correction)
-        if ended:
-            mission.intake.end(robot)
-        mission.worker.notify()
+
+        def take() -> tuple[bytes, int, bool]:
+            mission = state.mission
+            taken = mission.intake.take(robot, agent, body, correction)
+            if ended:
+                mission.intake.end(robot)
+            mission.worker.notify()
+            return taken
+
+        reply, refused, removed = await run_in_threadpool(take)
         state.measures.answer(robot, reply)
         headers = {REFUSED_HEADER: str(refused), REMOVED_HEADER: str(int(removed))}
         return Response(reply, media_type=MEDIA_TYPE, headers=headers)

@@ -1,7 +1,7 @@
 """State shared by all routes of the HTTP service."""
 
-import asyncio
 import itertools
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -90,7 +90,7 @@ class ServiceState:
     measures: ServiceMetrics = field(default_factory=ServiceMetrics)
     closing: bool = False
     """Whether the service is stopping and takes no new requests."""
-    changing: asyncio.Lock = field(default_factory=asyncio.Lock)
+    changing: threading.Lock = field(default_factory=threading.Lock)
     """Held while missions are created, opened or imported."""
 
     def close(self) -> None:
