@@ -111,7 +111,7 @@ def _calibrate_level(bag: "RosBag", config: LidarConfig, facings: list[Contradic
     coarse = BagCorrection(mounting=(x, y, theta), upside_down=upside_down)
     fine = _calibrate_finely(bag.corrected(coarse, ()), config)
     x, y, theta = se2.compose(fine.correction.mounting, coarse.mounting).tolist()
-    done = "--sensors laser-pose is kept" if bag.has_given_pose else "corrected"
+    done = "--sensors laser-pose is kept" if bag.options.laser_poses else "corrected"
     correction = replace(fine.correction, mounting=(x, y, theta), upside_down=upside_down)
     return Calibrated(fine.calibration, correction, (f"{found}; {done}", *fine.lines))
 

@@ -43,6 +43,10 @@ class LivePlan(NamedTuple):
     edge: Link | None
     """Frames of the odometry in tf; None: it is on a topic, or there is none."""
 
+    def is_odometry(self, item: object) -> bool:
+        """Whether something that was read is a reading of the odometry."""
+        return isinstance(item, OdometryReading) and self.edge in (None, (item.odom_frame, item.base_frame))
+
 
 class LivePlanner:
     """Collects what a plan needs, and says what is missing."""

@@ -6,7 +6,7 @@ whose odometry is silent from the start is mapped without.
 """
 
 from collections import Counter, defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import inf
 from typing import Any, NamedTuple
 
@@ -229,18 +229,16 @@ class LiveSensors:
 
     def _decide_clocks(self, plan: LivePlan) -> None:
         """Compare the clocks of the odometry and the IMU with that of the scans, by the first messages."""
-        lags_s: dict[type, list[float]] = defaultdict(list)
-        for topic, _, received_ns, early in self._early:
-            item = restamped(early, received_ns, self._clocks[topic].lag_ns)
-            is_other = isinstance(item, OdometryReading) and plan.edge not in (None, (item.odom_frame, item.base_frame))
-            if not is_other and topic not in self._topics.scans[1:]:
-                lags_s[type(item)].append(received_ns / NANOSECONDS - _end_s(item))
-        self._scan_lags_s = lags_s[PointCloud if self._topics.in_space else ScanMessage]
-        name = self._topics.odometry or "the odometry in tf"
-        self._odometry_ahead_s = self._ahead_s(name, lags_s[OdometryReading])
-        self._imu_ahead_s = self._ahead_s(self._topics.imu or "", lags_s[ImuReading])
+        duration_s = plan.lasers[0].first.duration_s
+        self._scan_lags_s = [lag_s - duration_s for lag_s in self._clocks[self._topics.scans[0]].lags_s]
+        found = (
+            (each, restamped(each.item, each.received_ns, self._clocks[each.topic].lag_ns)) for each in self._early
+        )
+        odometry_s = [each.received_ns / NANOSECONDS - item.stamp for each, item in found if plan.is_odometry(item)]
+        self._odometry_ahead_s = self._ahead_s(self._topics.odometry or "the odometry in tf", odometry_s)
+        self._imu_ahead_s = self._ahead_s(self._topics.imu or "", self._clocks[self._topics.imu or ""].lags_s)
 
-    def _ahead_s(self, name: str, lags_s: list[float]) -> float:
+    def _ahead_s(self, name: str, lags_s: Sequence[float]) -> float:
         ahead_s = clock_ahead_s(self._scan_lags_s, lags_s)
         if ahead_s:
             self._notify(ahead_note(name, ahead_s))
@@ -248,27 +246,22 @@ class LiveSensors:
 
     def _fix(self, topic: str, payload: bytes, received_ns: int) -> Iterator[GnssFix]:
         """The fixes; they wait for the mountings, and until a few of them show their clock."""
-        number = self._counts[topic]
+        number, clock = self._counts[topic], self._clocks[topic]
         try:
             content = self._codec.decode(payload, FIX)
         except ValueError:
             self.audit.add(Fault.BROKEN_MESSAGE, number)
             return
-        self._clocks[topic].note(content.header, received_ns)
+        clock.note(content.header, received_ns)
         self._early_fixes.append(_Early(topic, number, received_ns, content))
         if self._plan is None or (self._fixes is None and len(self._early_fixes) < FEWEST_LAGS):
             return
-        lag_ns = self._clocks[topic].lag_ns
         if self._fixes is None:
-            stamps = [
-                (each.received_ns, header_of(each.item.header, each.received_ns - lag_ns)[0])
-                for each in self._early_fixes
-            ]
-            ahead_s = self._ahead_s(topic, [ns / NANOSECONDS - stamp for ns, stamp in stamps])
+            ahead_s = self._ahead_s(topic, clock.lags_s)
             self._fixes = FixReader(self.planner.tree, self.planner.base_frame, ahead_s, self.audit)
         while self._early_fixes:
             _, number, came_ns, content = self._early_fixes.popleft()
-            yield from self._fixes.read(number, content, came_ns - lag_ns)
+            yield from self._fixes.read(number, content, came_ns - clock.lag_ns)
 
     def _decoded(self, topic: str, payload: bytes, received_ns: int) -> list[Item]:
         kind = self._topics.kinds[topic]
@@ -385,13 +378,10 @@ class LiveSensors:
         assert plan is not None  # nothing is read before
         if isinstance(item, ImuReading):
             self._axes = self._axes or ImuAxes(self.planner.tree, self.planner.base_frame)
-            if isinstance(reader, CloudStream):
-                yield from self._recorded(reader.add_imu(self._axes.row(item, self._imu_ahead_s)))
-            else:
-                reader.gyro.add(*self._axes.turn(item, self._imu_ahead_s))
+            yield from self._recorded(reader.add_imu(self._axes.row(item, self._imu_ahead_s)))
             return
         if isinstance(item, OdometryReading):
-            if self.planner.is_without_odometry or plan.edge not in (None, (item.odom_frame, item.base_frame)):
+            if self.planner.is_without_odometry or not plan.is_odometry(item):
                 return
             item = item._replace(stamp=item.stamp - self._odometry_ahead_s)
         if isinstance(item, ScanMessage | PointCloud) and self._has_stepped_back(item.stamp):
@@ -438,9 +428,3 @@ class LiveSensors:
                     self.audit.add(Fault.BROKEN_IMAGE, number)
         if self.audit.faults()[Fault.NO_ODOMETRY].count:
             self._notify("a scan has no odometry within 1 s and is left out; is the driver of the base alive?")
-
-
-def _end_s(item: Item) -> float:
-    if isinstance(item, PointCloud):
-        return item.stamp + float(item.times_s.max(initial=0.0))
-    return item.end if isinstance(item, ScanMessage) else item.stamp

@@ -14,12 +14,12 @@ from typing import Any, Final
 import numpy as np
 
 from fcslam.errors import SourceError
-from fcslam.records import CloudScan, SensorRecord
+from fcslam.records import CloudScan
 from fcslam.sources.bags.clouds import MOST_POINTS, TIMES, timed
 from fcslam.sources.bags.messages import LONGEST_SWEEP_S
-from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, reader_of
-from fcslam.sources.faults import Audit, Fault, Faults
-from fcslam.sources.gate import FIRST_MESSAGES, scan_window
+from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, CloudRecording, reader_of
+from fcslam.sources.faults import Audit, Fault
+from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.logs.archive import translate_errors
 from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud
 from fcslam.sources.source import WHOLE, ScanRange, Survey
@@ -47,18 +47,12 @@ def cloud_files(folder: Path) -> list[Path]:
     return []
 
 
-class CloudFolder:
+class CloudFolder(CloudRecording):
     """A folder of clouds as the recording of a robot with a 3D LiDAR and nothing else."""
 
     def __init__(self, path: Path, name: str) -> None:
-        self.name, self.path = name, path
+        super().__init__(path, name, "file")
         self._files = cloud_files(path)
-        self._audit = Audit("file")
-
-    @property
-    def faults(self) -> Faults:
-        """As in Source."""
-        return self._audit.faults()
 
     @cached_property
     def _stamps(self) -> list[float]:
@@ -96,17 +90,11 @@ class CloudFolder:
         return read_cloud(self._files[number], self._stamps[number])
 
     def survey(self, scans: ScanRange = WHOLE) -> Survey:
-        """As in Source."""
+        """As in ``CloudRecording``."""
         _, notes = self._reader
         stamps = self._stamps[scans.first : scans.end]
         duration_s = stamps[-1] - stamps[0] if stamps else 0.0
         return Survey(len(stamps), duration_s, 0.0, (BAND_LASER,), self._audit.faults(), notes)
-
-    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
-        """As in Source."""
-        audit = self._audit = Audit("file")
-        for _, scan in scan_window(self._scans(audit), scans, lambda _: True, audit):
-            yield scan
 
     def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:
         (reader, _), nothing = self._reader, np.zeros((0, 7))

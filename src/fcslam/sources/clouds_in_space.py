@@ -1,15 +1,19 @@
 """Turns of a 3D LiDAR from whatever recorded them: which points count, when each was measured, and bad recordings."""
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import tau
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
-from fcslam.records import CloudScan, FloatArray, LaserModel, frozen
+from fcslam.records import CloudScan, FloatArray, LaserModel, SensorRecord, frozen
+from fcslam.sources.faults import Audit, Faults
+from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.point_clouds import (
     DIRECTIONS,
     FARTHEST_M,
@@ -20,6 +24,7 @@ from fcslam.sources.point_clouds import (
     turn_of,
     unit_problem,
 )
+from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 BAND_LASER: Final = LaserModel(DIRECTIONS // 2, -np.pi, 2.0 * tau / DIRECTIONS, FARTHEST_M)
 """The 2D laser in ``base`` that a 3D LiDAR stands for."""
@@ -33,6 +38,38 @@ _FLOOR_M, _FLOOR_SHARE = 0.15, 0.05
 _BELOW_SHARE, _OPENINGS = 0.1, 10.0
 """A LiDAR that is mounted otherwise sees more points below the floor than this share; as it is, this many times fewer.
 """
+
+
+class CloudRecording(ABC):
+    """A recording of one robot with a 3D LiDAR."""
+
+    def __init__(self, path: Path, name: str, unit: str) -> None:
+        """``unit`` is what holds a cloud."""
+        self.path, self.name, self._unit = path, name, unit
+        self._audit = Audit(unit)
+
+    @property
+    def faults(self) -> Faults:
+        """As in Source."""
+        return self._audit.faults()
+
+    @abstractmethod
+    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+        """As in Source; clouds are counted, and not decoded."""
+
+    @abstractmethod
+    def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:
+        """All clouds with their numbers; ``audit`` counts the faults."""
+
+    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+        """As in Source; every cloud carries the readings of the other sensors."""
+        audit = self._audit = Audit(self._unit)
+        count = 0
+        for _, scan in scan_window(self._scans(audit), scans, lambda _: True, audit):
+            count += 1
+            yield scan
+        if scans == WHOLE:
+            check_consistency(self.path, audit.faults(), count, count)
 
 
 @dataclass(frozen=True)

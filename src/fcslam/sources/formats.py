@@ -57,10 +57,9 @@ def whole_clouds(source: Source, options: BagOptions | None) -> Source:
 
 def planar_note(sources: Sequence[Source]) -> str:
     """What robots without clouds do in a map in space, one line; empty if all have clouds."""
-    from fcslam.sources.bags.cloud_bag import CloudBag
-    from fcslam.sources.cloud_files import CloudFolder
+    from fcslam.sources.clouds_in_space import CloudRecording
 
-    planar = [source.name for source in sources if not isinstance(source, CloudBag | CloudFolder)]
+    planar = [source.name for source in sources if not isinstance(source, CloudRecording)]
     return IN_PLANE.format(", ".join(planar)) if planar else ""
 
 

@@ -3,6 +3,7 @@
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from math import hypot
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
@@ -11,6 +12,8 @@ from fcslam.geometry import se2
 from fcslam.records import Odometry, Sweep
 from fcslam.sources.bags.messages import OdometryReading
 from fcslam.sources.pose import Pose, relative_pose
+
+_stamp_of = attrgetter("stamp")
 
 SAMPLES: Final = 9
 """Poses by odometry that the motion during a sweep is fitted to."""
@@ -104,7 +107,3 @@ def moving_sweep(sweep: Sweep, stamp: float, readings: Sequence[Reading]) -> Swe
         return sweep
     (vx, vy, vtheta), (ax, ay, atheta) = velocity.tolist(), acceleration.tolist()
     return sweep._replace(velocity=(vx, vy, vtheta), acceleration=(ax, ay, atheta))
-
-
-def _stamp_of(reading: Reading) -> float:
-    return reading.stamp

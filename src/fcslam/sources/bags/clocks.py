@@ -28,6 +28,11 @@ class StampClock:
             self._lags_s.append((now_ns - stamp_ns) / NANOSECONDS)
 
     @property
+    def lags_s(self) -> Sequence[float]:
+        """Times from the stamps of the first messages to their recording, which count if none has a stamp."""
+        return self._lags_s or [0.0] * min(self.unstamped, FIRST_MESSAGES)
+
+    @property
     def lag_ns(self) -> int:
         """Time of recording less the clock of the stamps that are set, in whole milliseconds; 0 if none is missing."""
         return round(1e3 * median(self._lags_s)) * 10**6 if self.unstamped and self._lags_s else 0

@@ -2,42 +2,34 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import chain, islice
 
 from fcslam.errors import SourceError
-from fcslam.records import CloudScan, SensorRecord
+from fcslam.records import CloudScan
 from fcslam.sources.bags.cloud_scans import valid
-from fcslam.sources.bags.codec import CLOUDS
+from fcslam.sources.bags.codec import CLOUDS, IMU
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.imu import ImuAxes, imu_of, imu_topics
+from fcslam.sources.bags.imu import ImuAxes, imu_of
 from fcslam.sources.bags.plan import BagPlan, plan_of
 from fcslam.sources.bags.reader import CloudStream
 from fcslam.sources.bags.robots import slashed
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.bags.transforms import USUAL_BASES
-from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, reader_of
-from fcslam.sources.faults import Audit, Fault, Faults
-from fcslam.sources.gate import FIRST_MESSAGES, check_consistency, scan_window
+from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, CloudRecording, reader_of
+from fcslam.sources.faults import Audit, Fault
+from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
 
-_audit = partial(Audit, "message")
 
-
-class CloudBag:
+class CloudBag(CloudRecording):
     """The clouds of one robot in a bag."""
 
-    def __init__(self, bag: RosBag, options_topic: Topic) -> None:
-        """``options_topic`` has the clouds."""
-        self.name, self.path = bag.name, bag.path
-        self._bag, self._topic = bag, options_topic
-        self._audit = _audit()
-
-    @property
-    def faults(self) -> Faults:
-        """As in Source."""
-        return self._audit.faults()
+    def __init__(self, bag: RosBag, topic: Topic) -> None:
+        """``topic`` has the clouds."""
+        super().__init__(bag.path, bag.name, "message")
+        self._bag, self._topic = bag, topic
 
     @cached_property
     def _plan(self) -> BagPlan:
@@ -53,7 +45,7 @@ class CloudBag:
         return reader_of(first, plan.scans.mounting(self._topic, first[0].frame), self._bag.options.cloud_band, where)
 
     def survey(self, scans: ScanRange = WHOLE) -> Survey:
-        """As in Source; clouds are counted, and not decoded."""
+        """As in ``CloudRecording``."""
         _, notes = self._reader
         plan, track = self._plan, PathSummary()
         for message in self._bag.bag.read(plan.odometry.topics if plan.odometry else ()):
@@ -66,20 +58,10 @@ class CloudBag:
         faults = self._audit.faults()
         return Survey(count, share * (last_ns - first_ns) * 1e-9, share * track.length_m, (BAND_LASER,), faults, notes)
 
-    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
-        """As in Source; every cloud carries the readings of the other sensors."""
-        audit = self._audit = _audit()
-        count = 0
-        for _, scan in scan_window(self._scans(audit), scans, lambda _: True, audit):
-            count += 1
-            yield scan
-        if scans == WHOLE:
-            check_consistency(self.path, audit.faults(), count, count)
-
     def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:
         plan, (reader, _) = self._plan, self._reader
         base_frame = self._bag.options.base_frame or next((f for f in USUAL_BASES if f in plan.tree), USUAL_BASES[-1])
-        imu = imu_topics(self._bag.robot)[:1]
+        imu = self._bag.robot.of_type(IMU)[:1]
         odometry = () if plan.odometry is None else plan.odometry.topics
         stream, axes = CloudStream(reader, audit), ImuAxes(plan.tree, base_frame)
         for message in self._bag.bag.read([*odometry, *imu, self._topic]):
@@ -104,8 +86,7 @@ def in_3d(source: Source) -> Source:
     """The same recording with its clouds read whole, if it has any; else as it is, for a robot with a 2D laser."""
     if not isinstance(source, RosBag):
         return source
-    clouds = [topic for topic in source.robot.topics if topic.type in CLOUDS and topic.message_count]
-    if wanted := set(map(slashed, source.options.scan_topics)):
-        clouds = [topic for topic in clouds if slashed(topic.name) in wanted]
-    best = min(clouds, key=lambda topic: (-topic.message_count, topic.name), default=None)
+    wanted = set(map(slashed, source.options.scan_topics))
+    clouds = (topic for topic in source.robot.of_type(*CLOUDS) if not wanted or slashed(topic.name) in wanted)
+    best = next(clouds, None)
     return source if best is None else CloudBag(source, best)

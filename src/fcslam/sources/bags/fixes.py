@@ -6,10 +6,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from fcslam.records import GnssFix
-from fcslam.sources.bags.codec import FIX
-from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import header_of
-from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, mounting
 from fcslam.sources.faults import Audit, Fault
 
@@ -23,12 +20,6 @@ FIX_INTERVAL_S: Final = 0.9
 LARGEST_SIGMA_M: Final = 1e4
 FARTHEST_ANTENNA_M: Final = 50.0
 """Largest distance of the antenna from the robot's base."""
-
-
-def fix_topics(robot: BagRobot) -> list[Topic]:
-    """The topics of fixes of a robot, the one with most messages first."""
-    topics = [topic for topic in robot.topics if topic.type == FIX and topic.message_count]
-    return sorted(topics, key=lambda topic: (-topic.message_count, topic.name))
 
 
 class FixReader:

@@ -40,7 +40,12 @@ class ScanMessage(NamedTuple):
     @property
     def end(self) -> float:
         """Stamp of its last measurement."""
-        return self.stamp if self.sweep is None else self.stamp + max(self.sweep.first_s, self.sweep.last_s)
+        return self.stamp + self.duration_s
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the stamp to the last measurement."""
+        return 0.0 if self.sweep is None else max(self.sweep.first_s, self.sweep.last_s)
 
 
 class OdometryReading(NamedTuple):

@@ -14,6 +14,7 @@ from bisect import bisect_right, insort
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import NamedTuple
 
 from fcslam.records import FloatArray
@@ -51,6 +52,8 @@ class PosedImage(NamedTuple):
     T_odom_base: Pose | None
     """None if there is no reading within 1 s."""
 
+
+_stamp_of = attrgetter("stamp")
 
 _PoseMatch = tuple[Pose, Fault | None]
 """A pose and its fault."""
@@ -127,10 +130,6 @@ def _with_pose(waiting: _QueuedItem, readings: list[OdometryReading]) -> tuple[i
     if scan.sweep is not None and fault is not Fault.NO_ODOMETRY:
         scan = scan._replace(sweep=moving_sweep(scan.sweep, scan.stamp, readings))
     return waiting.number, PosedScan(scan, T_odom_base, fault)
-
-
-def _stamp_of(reading: OdometryReading) -> float:
-    return reading.stamp
 
 
 def _match(readings: list[OdometryReading], stamp: float) -> _PoseMatch | None:

@@ -1,7 +1,6 @@
 """Decides once, before a bag is read, which of its topics and frames are read, and how."""
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from math import tau
 from typing import NamedTuple
@@ -13,11 +12,9 @@ from fcslam.sources.bags.camera import Calibration, image_of
 from fcslam.sources.bags.census import BagMessage
 from fcslam.sources.bags.clocks import ahead_note, clock_ahead_s
 from fcslam.sources.bags.cloud_scans import BagScans, calibration_in, valid
-from fcslam.sources.bags.codec import LASER_SCANS, NANOSECONDS, ODOMETRY
+from fcslam.sources.bags.codec import FIX, IMU, LASER_SCANS, NANOSECONDS, ODOMETRY
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.fixes import fix_topics
-from fcslam.sources.bags.imu import imu_topics
-from fcslam.sources.bags.messages import OdometryReading, header_of, odometry_in
+from fcslam.sources.bags.messages import OdometryReading, odometry_in
 from fcslam.sources.bags.options import NO_ODOMETRY, BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Message
 from fcslam.sources.bags.rig import RecordedLaser, recorded_laser
@@ -129,12 +126,11 @@ class _Planner:
         odometry = self._odometry(lasers[0].first.frame)
         ahead_s = fixes_ahead_s = imu_ahead_s = 0.0
         if odometry is not None:
-            readings, read = odometry.readings, odometry.topics
-            ahead_s = self._ahead_s(odometry.name, read, lambda message: [each.stamp for each in readings(message)])
-        for fixes in fix_topics(self._robot)[:1]:
-            fixes_ahead_s = self._ahead_s(fixes.name, [fixes], _stamp_of)
-        for imu in imu_topics(self._robot)[:1] if odometry is None else ():
-            imu_ahead_s = self._ahead_s(imu.name, [imu], _stamp_of)
+            ahead_s = self._ahead_s(lasers[0], odometry.name, self._lags_s(odometry))
+        for fixes in self._robot.of_type(FIX)[:1]:
+            fixes_ahead_s = self._ahead_s(lasers[0], fixes.name, self._bag.census[fixes].clock.lags_s)
+        for imu in self._robot.of_type(IMU)[:1] if odometry is None else ():
+            imu_ahead_s = self._ahead_s(lasers[0], imu.name, self._bag.census[imu].clock.lags_s)
         calibration = calibration_in(self._robot, topics.camera_info)
         notes = tuple(self._notes)
         clocks_s = ahead_s, fixes_ahead_s, imu_ahead_s
@@ -229,23 +225,22 @@ class _Planner:
             for scan in islice(found, None, None, _STRIDE)
         )
 
-    def _ahead_s(self, name: str, topics: Sequence[Topic], stamps_of: Callable[[BagMessage], list[float]]) -> float:
-        """How far the clock of these topics is ahead of that of the scans."""
-        ahead_s = clock_ahead_s(self._scans_lags_s, self._lags_s(topics, stamps_of))
+    def _ahead_s(self, laser: RecordedLaser, name: str, lags_s: Sequence[float]) -> float:
+        """How far the clock of a sensor with these lags is ahead of that of the scans, which are stamped before they
+        end.
+        """
+        scans_s = self._bag.census[laser.topic].clock.lags_s
+        ahead_s = clock_ahead_s([lag_s - laser.first.duration_s for lag_s in scans_s], lags_s)
         if ahead_s:
             self._notes.append(f"{self._path}: {ahead_note(name, ahead_s)}")
         return ahead_s
 
-    @cached_property
-    def _scans_lags_s(self) -> list[float]:
-        return self._lags_s(self._topics.scans[:1], lambda message: [self._scans.scan(message).end])
-
-    def _lags_s(self, topics: Sequence[Topic], ends_of: Callable[[BagMessage], list[float]]) -> list[float]:
-        """Times from the measurement to the recording of the first messages."""
+    def _lags_s(self, odometry: OdometryInput) -> list[float]:
+        """Times from the stamps to the recording of the first readings."""
         return [
-            message.bag_time_ns / 1e9 - end_s
-            for message in islice(self._bag.read(topics), FIRST_MESSAGES)
-            for end_s in chain.from_iterable(valid([message], ends_of))
+            message.bag_time_ns / NANOSECONDS - reading.stamp
+            for message in islice(self._bag.read(odometry.topics), FIRST_MESSAGES)
+            for reading in chain.from_iterable(valid([message], odometry.readings))
         ]
 
     def _jumps(self, topic: Topic) -> bool:
@@ -257,7 +252,3 @@ class _Planner:
             return tau
         scan = next(valid(self._bag.read([topic]), lambda message: message.content), None)
         return 0.0 if scan is None else scan.beams.span_rad
-
-
-def _stamp_of(message: BagMessage) -> list[float]:
-    return [header_of(message.content.header, message.unstamped_ns)[0]]

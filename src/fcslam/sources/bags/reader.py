@@ -10,9 +10,8 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from fcslam.records import CloudScan, FloatArray
+from fcslam.records import CloudScan, FloatArray, frozen
 from fcslam.sources.bags.camera import ImageMessage
-from fcslam.sources.bags.imu import GyroReadings
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage
 from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedImage, PosedScan
 from fcslam.sources.bags.rig import RecordedLaser
@@ -28,6 +27,8 @@ _LONGEST_QUEUE = 20
 
 _MOST_CLOUDS = 3
 """Clouds that wait for the readings of other sensors; beyond, these have stopped."""
+_AFTER_S = 0.02
+"""Readings of a gyro so long after a scan show its end."""
 
 Numbered = tuple[int, Entry]
 """An entry with the number of its message."""
@@ -76,6 +77,25 @@ class ScanMerger:
         return min((queue for queue in self._queues if queue), key=lambda queue: queue[0][1].stamp).popleft()
 
 
+class _Readings:
+    """Readings of a sensor that no scan was given yet: rows that begin with their stamps."""
+
+    def __init__(self, columns: int) -> None:
+        self._rows: deque[list[float]] = deque()
+        self._columns = columns
+        self.newest_s = -np.inf
+
+    def add(self, row: list[float]) -> None:
+        self._rows.append(row)
+        self.newest_s = row[0]
+
+    def take(self, end_s: float = np.inf) -> FloatArray:
+        taken = []
+        while self._rows and self._rows[0][0] <= end_s:
+            taken.append(self._rows.popleft())
+        return np.array(taken).reshape(-1, self._columns)
+
+
 class SensorReader:
     """Turns scans, odometry and images into consistent entries with poses."""
 
@@ -84,14 +104,15 @@ class SensorReader:
         lasers: Sequence[RecordedLaser],
         has_odometry: bool,
         audit: Audit,
-        turns: Iterable[tuple[float, float]] = (),
+        imu: Iterable[list[float]] = (),
     ) -> None:
-        """``audit`` counts the faults; ``turns`` are readings of the gyro of a robot without odometry."""
+        """``audit`` counts the faults; ``imu`` are readings of the IMU of a robot without odometry."""
         self._joiners = {number: SectorJoiner() for number, laser in enumerate(lasers) if laser.is_in_sectors}
         self._merger = ScanMerger(len(lasers))
         self._pairing = OdometryPairing() if has_odometry else None
-        self.gyro = GyroReadings(turns)
-        """What the gyro of a robot without odometry measured."""
+        self._imu = _Readings(7)
+        for row in imu:
+            self._imu.add(row)
         self._gates, self._audit = [ScanGate(laser.first.beams, audit) for laser in lasers], audit
         self._number = 0
 
@@ -103,6 +124,11 @@ class SensorReader:
             joined = self._joiners[item.laser].add(item)
         for each in joined:
             yield from self._posed(self._merger.add(number, each))
+
+    def add_imu(self, row: list[float]) -> Iterator[Numbered]:
+        """Read the next row of ``ImuAxes`` of a robot without odometry; nothing waits for it."""
+        self._imu.add(row)
+        return iter(())
 
     def finish(self) -> Iterator[Numbered]:
         """Yield all that waits, as no more messages come."""
@@ -136,9 +162,14 @@ class SensorReader:
             if self._pairing is not None:
                 yield from self._admitted(self._pairing.add(number, item))
             elif isinstance(item, ScanMessage):
-                yield from self._admitted([(number, PosedScan(item, UNKNOWN_POSE, None, self.gyro.take(item.end)))])
+                yield from self._admitted([(number, PosedScan(item, UNKNOWN_POSE, None, self._turns(item.end)))])
             elif isinstance(item, ImageMessage):
                 yield number, PosedImage(item, None)
+
+    def _turns(self, end_s: float) -> FloatArray | None:
+        """The readings of the gyro for a scan that ends at ``end_s``, as in ``LaserScan``."""
+        has_gyro = self._imu.newest_s > -np.inf
+        return frozen(self._imu.take(end_s + _AFTER_S)[:, (0, 3)]) if has_gyro else None
 
     def _admitted(self, entries: Iterable[Numbered]) -> Iterator[Numbered]:
         """The consistent entries; counts the faults of the rest. A scan without odometry is not consistent."""
@@ -151,23 +182,6 @@ class SensorReader:
                 if entry.fault is Fault.NO_ODOMETRY:
                     continue
             yield number, entry
-
-
-class _Readings:
-    """Readings of a sensor that no cloud has carried yet."""
-
-    def __init__(self, columns: int) -> None:
-        self._rows: list[list[float]] = []
-        self._columns = columns
-        self.newest_s = -np.inf
-
-    def add(self, row: list[float]) -> None:
-        self._rows.append(row)
-        self.newest_s = row[0]
-
-    def take(self) -> FloatArray:
-        rows, self._rows = self._rows, []
-        return np.array(rows).reshape(-1, self._columns)
 
 
 class CloudStream:

@@ -38,6 +38,11 @@ class BagRobot(NamedTuple):
     """By the name of a topic of odometry."""
     notes: tuple[str, ...] = ()
 
+    def of_type(self, *types: str) -> list[Topic]:
+        """The topics of these types that have messages, the one with most messages first."""
+        topics = [topic for topic in self.topics if topic.type in types and topic.message_count]
+        return sorted(topics, key=lambda topic: (-topic.message_count, topic.name))
+
 
 @dataclass(slots=True)
 class _Member:

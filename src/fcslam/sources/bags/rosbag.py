@@ -17,9 +17,10 @@ from fcslam.geometry import se2
 from fcslam.records import GnssFix, Odometry, SensorRecord, frozen
 from fcslam.sources.bags.census import DecodedBag
 from fcslam.sources.bags.cloud_scans import valid
+from fcslam.sources.bags.codec import FIX, IMU
 from fcslam.sources.bags.container import is_transforms
-from fcslam.sources.bags.fixes import FixReader, fix_topics
-from fcslam.sources.bags.imu import ImuAxes, imu_of, imu_topics
+from fcslam.sources.bags.fixes import FixReader
+from fcslam.sources.bags.imu import ImuAxes, imu_of
 from fcslam.sources.bags.messages import OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
@@ -113,7 +114,7 @@ class RosBag:
         fixes = deque(found)
         for kind, fault in faults.counts.items():
             audit.add(kind, fault.first_line, fault.count)
-        entries = self._entries(audit, with_images=rig.camera is not None, turns=self._turns)
+        entries = self._entries(audit, with_images=rig.camera is not None, imu=self._imu)
         for number, entry in scan_window(entries, scans, _is_scan, audit):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
@@ -134,20 +135,20 @@ class RosBag:
                     audit.add(Fault.BROKEN_IMAGE, number)
 
     @cached_property
-    def _turns(self) -> list[tuple[float, float]]:
-        """Angular velocities about the vertical by the gyro of a robot without odometry, with their stamps."""
+    def _imu(self) -> list[list[float]]:
+        """The readings of the IMU of a robot without odometry."""
         if self.plan.odometry is not None:
             return []
         axes = ImuAxes(self.plan.tree, self._reading.base_frame)
-        messages = self.bag.read(imu_topics(self.robot)[:1])
+        messages = self.bag.read(self.robot.of_type(IMU)[:1])
         readings = valid(messages, lambda each: imu_of(each.content, each.unstamped_ns))
-        return sorted(axes.turn(each, self.plan.imu_ahead_s) for each in readings)
+        return sorted(axes.row(each, self.plan.imu_ahead_s) for each in readings)
 
     @cached_property
     def _fixes(self) -> tuple[tuple[GnssFix, ...], Faults]:
         audit, plan = _audit(), self.plan
         reader = FixReader(plan.tree, self._reading.base_frame, plan.fixes_ahead_s, audit)
-        messages = self.bag.read(fix_topics(self.robot)[:1])
+        messages = self.bag.read(self.robot.of_type(FIX)[:1])
         found = chain.from_iterable(reader.read(each.number, each.decoded, each.unstamped_ns) for each in messages)
         return tuple(sorted(found, key=lambda fix: fix.stamp)), audit.faults()
 
@@ -156,10 +157,10 @@ class RosBag:
         audit: Audit,
         errors: dict[str, str] | None = None,
         with_images: bool = False,
-        turns: Iterable[tuple[float, float]] = (),
+        imu: Iterable[list[float]] = (),
     ) -> Iterator[Numbered]:
         plan, errors = self.plan, {} if errors is None else errors
-        reader = SensorReader(plan.lasers, plan.odometry is not None, audit, turns)
+        reader = SensorReader(plan.lasers, plan.odometry is not None, audit, imu)
         for message in self.bag.read(plan.read_topics(with_images)):
             try:
                 items = plan.items(message, self.options.correction)
@@ -268,14 +269,12 @@ class RosBag:
         """Whether the first laser is."""
         return self._reading.rig.upside_down[0]
 
-    @property
-    def has_given_pose(self) -> bool:
-        """Whether the user says how the laser is mounted, which is never corrected."""
-        return bool(self.options.laser_poses)
-
     def corrected(self, correction: BagCorrection, notes: tuple[str, ...]) -> "RosBag":
-        """The same bag, read with a correction that ``notes`` explain; the floors of an earlier one stay left out."""
-        if self.has_given_pose:
+        """The same bag, read with a correction that ``notes`` explain; the floors of an earlier one stay left out.
+
+        A mounting that the user gives is never corrected.
+        """
+        if self.options.laser_poses:
             correction = replace(correction, mounting=(0.0, 0.0, 0.0), upside_down=False)
         correction = replace(correction, floors=correction.floors or self.options.correction.floors)
         options = replace(self.options, correction=correction)
