@@ -13,7 +13,7 @@ from fcslam.errors import SourceError
 from fcslam.records import LaserScan
 from fcslam.sources.bags.container import is_bag, parts_of
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.logs.archive import head, is_folder, robot_name, translate_errors
+from fcslam.sources.logs.archive import head, robot_name, translate_errors
 from fcslam.sources.logs.carmen import is_carmen
 from fcslam.sources.logs.carmen_log import CarmenLog
 from fcslam.sources.source import Source
@@ -154,7 +154,8 @@ def format_of(path: Path) -> str:
             if format_of(part) == LOG:
                 raise SourceError(f"{part}: a {LOG} is not a part of several; give one recording, or parts of a bag")
         return BAG
-    content = b"" if is_folder(path) else head(path)
+    is_folder = os.path.isdir(path)
+    content = b"" if is_folder else head(path)
     if content.startswith(b"PK\x03\x04"):
         raise SourceError(f"{path}: is a zip archive; unpack it, and give the recording in it")
     if is_carmen(content):
@@ -163,7 +164,7 @@ def format_of(path: Path) -> str:
         if is_bag(path, content):
             return BAG
     known = f"{LOG} or {BAG}"
-    if is_folder(path):
+    if is_folder:
         raise SourceError(f"{path}: is a folder, not a recording; give the file of a recording ({known})")
     if path.name == "metadata.yaml":
         raise SourceError(f"{path}: describes a bag; give its folder, {path.parent}")

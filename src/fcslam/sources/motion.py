@@ -31,8 +31,6 @@ LONGEST_UPDATE_S: Final = 0.35
 """A robot whose odometry does not change for longer stands still."""
 STILL_M, STILL_RAD = 0.005, 0.003
 """Odometry that moved less stands still."""
-LEAST_STEP_RAD = 0.005
-"""A smaller turn between two readings is that of an encoder at a low speed."""
 
 
 Reading = Odometry | OdometryReading
@@ -69,7 +67,7 @@ class OdometryUpdates:
             if max(abs(x), abs(y), abs(theta)) < ROUNDING:
                 self._repeats += 1
                 return not 0.0 <= held_s <= self.period_s
-            if hypot(x, y) > STILL_M or abs(theta) > LEAST_STEP_RAD:
+            if hypot(x, y) > STILL_M or abs(theta) > STILL_RAD:
                 self._moves += 1
                 if self._repeats and 0.0 < held_s <= LONGEST_UPDATE_S:
                     self._steps += 1

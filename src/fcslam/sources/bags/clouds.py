@@ -11,6 +11,7 @@ from fcslam.sources.bags.codec import IMAGE, POINT_CLOUD
 from fcslam.sources.bags.messages import LONGEST_SWEEP_S, header_of
 from fcslam.sources.bags.options import GivenPose
 from fcslam.sources.bags.transforms import in_space, planar
+from fcslam.sources.gate import MAX_STEP_BACK_S
 from fcslam.sources.point_clouds import CloudMounting, PointCloud, depth_points
 
 MOST_POINTS: Final = 4_000_000
@@ -25,12 +26,8 @@ _OVER_INTERVAL: Final = 1.2
 """Largest ratio of the duration of a cloud to the time between two clouds."""
 _LONGEST_IN_SECONDS: Final = 0.9
 """Times of points that are seconds span less: from 0 to 1 they are shares of a turn."""
-_BULK: Final = 0.5
-"""Share of the points of a cloud, in the middle of all times, that show the unit."""
 _REACH: Final = 4.0
-"""Times that are farther from those of the bulk than this many times its duration are wrong, as of lost packets."""
-_NEAR_STAMP_S: Final = 1.5
-"""Times that begin this near to the stamp, or to 0, are by its clock, or after it."""
+"""Times farther from the middle half of all than this many times its duration are wrong, as of lost packets."""
 _DEPTHS: Final = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
 """Type and unit of the pixels of a depth image, by its encoding."""
 _OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -165,7 +162,7 @@ def timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
     if not known.any():
         return cloud
     after = (times - np.sort(times[known])[np.count_nonzero(known) // 2]).astype(np.float64)
-    low, high = np.quantile(after[known], (0.5 - 0.5 * _BULK, 0.5 + 0.5 * _BULK)).tolist()
+    low, high = np.quantile(after[known], (0.25, 0.75)).tolist()  # the middle half shows the unit
     if low == high:
         return cloud
     is_near = np.abs(after - 0.5 * (low + high)) < (0.5 + _REACH) * (high - low)  # false for NaN
@@ -173,13 +170,13 @@ def timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
     cloud = cloud._replace(points=points, left_out=int(np.count_nonzero(~is_near)))
     for unit_s in _UNITS_S:
         most_s = min(longest_s, _LONGEST_IN_SECONDS) if unit_s == 1.0 else longest_s
-        if _SHORTEST_CLOUD_S <= (high - low) / _BULK * unit_s <= most_s:
+        if _SHORTEST_CLOUD_S <= 2.0 * (high - low) * unit_s <= most_s:
             break
     else:
         return cloud._replace(points=points[np.argsort(after, kind="stable")], is_in_order=True)
     first_s = float(times.min()) * unit_s
     begin_s = min(first_s, first_s - cloud.stamp, key=abs)
-    if abs(begin_s) > _NEAR_STAMP_S:
+    if abs(begin_s) > MAX_STEP_BACK_S:
         begin_s = 0.0  # by another clock: the stamp is that of the first point
     return cloud._replace(times_s=begin_s + (after - after.min()) * unit_s)
 

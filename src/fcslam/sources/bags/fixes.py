@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from fcslam.records import GnssFix
 from fcslam.sources.bags.messages import header_of
+from fcslam.sources.bags.rig import FARTHEST_SENSOR_M
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, mounting
 from fcslam.sources.faults import Audit, Fault
 
@@ -18,8 +19,6 @@ NO_FIX: Final = -1
 FIX_INTERVAL_S: Final = 0.9
 """Least time between two fixes that are used; the errors of nearer ones are the same."""
 LARGEST_SIGMA_M: Final = 1e4
-FARTHEST_ANTENNA_M: Final = 50.0
-"""Largest distance of the antenna from the robot's base."""
 
 
 class FixReader:
@@ -64,7 +63,7 @@ def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str)
     east2, north2 = float(content.position_covariance[0]), float(content.position_covariance[4])
     sigma_m = SIGMA_M.get(int(content.status.status), SIGMA_M[0])
     if content.position_covariance_type and 0.0 < east2 < LARGEST_SIGMA_M**2 and 0.0 < north2 < LARGEST_SIGMA_M**2:
-        sigma_m = min((0.5 * (east2 + north2)) ** 0.5, LARGEST_SIGMA_M)
+        sigma_m = (0.5 * (east2 + north2)) ** 0.5
     return GnssFix(
         stamp,
         latitude,
@@ -81,6 +80,6 @@ def _antenna(tree: TransformTree, base_frame: str, frame: str) -> tuple[float, f
         x, y, _ = mounting(tree.fixed(base_frame, frame)).T_base_laser
     except NoTransformError:
         return 0.0, 0.0
-    if not math.hypot(x, y) <= FARTHEST_ANTENNA_M:
+    if not math.hypot(x, y) <= FARTHEST_SENSOR_M:
         raise ValueError(f"the antenna is {math.hypot(x, y):g} m from the robot")
     return x, y

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
+from fcslam.geometry.beams import SAME_VIEW_RAD
 from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -23,15 +24,12 @@ from fcslam.sources.bags.records import OTHER_ENCODING
 from fcslam.sources.bags.robots import is_truth, slashed
 from fcslam.sources.bags.transforms import last_part
 
-_NAMED_AT_MOST = 15
 _NEEDED: Mapping[str, tuple[tuple[str, ...], str]] = {
     "--sensors scan-topic": ((*SCANS, IMAGE), f"{SCAN}, {POINT_CLOUD} or a depth image"),
     "--sensors odom-topic": ((ODOMETRY, TRANSFORMS, OLD_TRANSFORMS), f"{ODOMETRY}, or tf"),
     "--sensors camera-topic": ((COMPRESSED_IMAGE, IMAGE), f"{COMPRESSED_IMAGE} or {IMAGE}"),
 }
 """Types of the topics that each option may name."""
-_SAME_VIEW_RAD = 0.1
-"""Fields of view that differ by less are equally wide."""
 
 
 class KnownTopics(NamedTuple):
@@ -139,7 +137,7 @@ def _best_scan(scans: Sequence[Topic], field_of_view_rad: Callable[[Topic], floa
     if len(scans) == 1:
         return scans[0]
     view_rad = {topic: field_of_view_rad(topic) for topic in scans}
-    wide = [topic for topic in scans if view_rad[topic] > max(view_rad.values()) - _SAME_VIEW_RAD]
+    wide = [topic for topic in scans if view_rad[topic] > max(view_rad.values()) - 2.0 * SAME_VIEW_RAD]
     return min(
         wide, key=lambda topic: (topic.type != SCAN, last_part(topic.name) != "scan", -topic.message_count, topic.name)
     )
@@ -206,9 +204,5 @@ def _note(known: KnownTopics, what: str, option: str, chosen: Topic, candidates:
 
 
 def _listed(known: KnownTopics) -> str:
-    topics = sorted({*known.own, *known.others})
-    if not topics:
-        return "there are no topics"
-    named = ", ".join(f"{one_line(topic.name)} ({one_line(topic.type)})" for topic in topics[:_NAMED_AT_MOST])
-    more = f" and {len(topics) - _NAMED_AT_MOST} more" if len(topics) > _NAMED_AT_MOST else ""
-    return f"the topics are {named}{more}"
+    named = ", ".join(f"{topic.name} ({topic.type})" for topic in sorted({*known.own, *known.others}))
+    return f"the topics are {one_line(named)}" if named else "there are no topics"

@@ -16,8 +16,6 @@ from fcslam.sources.pose import Pose
 Quaternion = tuple[float, float, float, float]
 """Unit quaternion (x, y, z, w)."""
 
-_ROUNDING = 1e-15
-"""A quaternion whose length differs from 1 by less is not normalised."""
 _STILL = 0.01
 """Largest difference between the messages of a fixed transform, in metres or quaternion units."""
 _LARGEST_SWAY_RAD = radians(20.0)
@@ -57,8 +55,6 @@ def transform_of(translation_m: tuple[float, float, float], rotation: Quaternion
         raise ValueError(f"the orientation {x:g}, {y:g}, {z:g}, {w:g} is not a unit quaternion")
     if not all(map(isfinite, translation_m)):
         raise ValueError("the translation is not finite")
-    if abs(length - 1.0) < _ROUNDING:
-        return Transform(translation_m, rotation)
     return Transform(translation_m, (x / length, y / length, z / length, w / length))
 
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from stat import S_ISDIR, S_ISREG
 
 from fcslam.errors import SourceError
 from fcslam.untrusted import open_unpacked
@@ -25,15 +24,6 @@ def robot_name(path: Path) -> str:
     while match := _LOG_SUFFIX.search(stem):
         stem = stem[: match.start()]
     return _UNSAFE.sub("_", stem).strip("._-") or "robot"
-
-
-def is_folder(path: Path) -> bool:
-    """Whether there is a folder, and no file."""
-    with translate_errors(path):
-        mode = path.stat().st_mode
-        if not (S_ISDIR(mode) or S_ISREG(mode)):
-            raise SourceError(f"{path}: is a pipe or device, and a recording is read twice; write it to a file first")
-    return S_ISDIR(mode)
 
 
 def head(path: Path) -> bytes:
