@@ -5,7 +5,6 @@
 To correct a page, correct the help of the command or the docstring of the route.
 """
 
-import json
 import re
 import sys
 from collections import Counter
@@ -32,7 +31,7 @@ The command `fcslam` has the subcommands and options below. `make docs` writes t
 the option `--help` of each command prints the same.
 """
 
-ROWS = ["| argument or option | default or range | meaning |", "|---|---|---|"]
+ROWS = ["| name | default or range | meaning |", "|---|---|---|"]
 LONG = 8
 """Words from which on a row that several commands share is written once."""
 
@@ -42,7 +41,7 @@ REST = """\
 A running service answers these HTTP requests for its state, maps and edits. `make docs` writes the page from the code.
 
 - A service on your machine: `fcslam serve --data cloud` listens at `http://127.0.0.1:8340`.
-- `/openapi.json` describes all requests, parameters and answers for programs.
+- `/openapi.json` describes all requests, parameters and answers, each number with its unit.
 - Roles: each token has the role robot, viewer or admin. An admin may do what a viewer may. A robot acts in its own name
   only. See [deployment](../howto/deploy.md).
 - An error is one line of JSON, `{"error": "..."}`.
@@ -95,7 +94,7 @@ def refer(text: str, shared: list[str]) -> str:
         return text
     names = [re.search(r"--[\w-]+", line.partition(" | ")[0]) for line in found]
     listed = ", ".join(f"`{name[0]}`" for name in names if name)
-    also = f"Also {listed}: [options of several commands](#options-of-several-commands)."
+    also = f"[Shared options](#options-of-several-commands): {listed}."
     kept = [line for line in lines if line not in shared]
     end = max(k for k, line in enumerate(kept) if line.startswith("| ")) + 1
     if kept[end - 1] == ROWS[0]:  # no row is left
@@ -174,23 +173,7 @@ def rest_page() -> str:
         "\n".join([f"## {name.capitalize()}", "", "| request | role | does |", "|---|---|---|", *rows, ""])
         for name, rows in groups.items()
     ]
-    numbers = ["## Numbers in answers", "", "| answer | field | meaning and unit |", "|---|---|---|"]
-    numbers += [f"| {answer} | `{field}` | {cell(meaning)} |" for answer, field, meaning in numbers_of(app.openapi())]
-    return "\n".join([REST, *parts, *numbers, ""])
-
-
-def numbers_of(described: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Answer, field and meaning of all numbers with a unit or a range that viewers get, as OpenAPI describes them."""
-    schemas = described["components"]["schemas"]
-    shown = [
-        path["get"] for path in described["paths"].values() if path.get("get", {}).get("tags") in (["fleet"], ["maps"])
-    ]
-    answers = re.findall(r"schemas/(\w+)", json.dumps([operation["responses"]["200"] for operation in shown]))
-    for name in sorted(set(answers)):
-        for field, schema in schemas[name]["properties"].items():
-            meaning = schema.get("description", "")
-            if re.search(r'"type": "(number|integer)"', json.dumps(schema)) and not meaning.startswith("number of"):
-                yield name, field, meaning
+    return "\n".join([REST, *parts])
 
 
 def roles_of(routes: Iterable[Any]) -> Iterator[tuple[tuple[str, str], str]]:

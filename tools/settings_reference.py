@@ -47,6 +47,7 @@ UNITS = {
 """By the suffix of a key; longer ones come first."""
 
 NO_UNIT = "-"
+HEADER = ["| key | default | allowed | effect |", "|---|---|---|---|"]
 
 HEAD = """\
 # Settings
@@ -82,8 +83,7 @@ fcslam tools config > mission.yaml
 fcslam map robot1.clf robot2.clf -o runs/building --config mission.yaml
 ```
 
-- A file needs only the keys that you change. Missing keys have their default values.
-- An unknown key or a value out of range is an error. The message names the nearest known key.
+- A file needs only the keys that you change. An unknown key is an error that names the nearest known one.
 - Every run folder contains the complete configuration of the run, `config.yaml`.
 - `fcslam map --config paper` begins with [the paper's settings](../results/paper.md) in place of the defaults. The keys
   of a further `--config FILE` override them.
@@ -147,23 +147,23 @@ LEARNING_ROBOT = """\
 def cloud_page() -> str:
     """How to set settings, and those of the cloud and the map."""
     cloud = CLOUD.format(cloud=", ".join(f"`{key}`" for key in CloudConfig.model_fields))
-    return "\n".join([HEAD, cloud, *tables(MissionConfig(), documented=(RobotConfig,))])
+    return "\n".join([HEAD, cloud, table(MissionConfig(), documented=(RobotConfig,))])
 
 
 def robot_page() -> str:
     """The settings of the robots, without those of LiDAR SLAM."""
-    return "\n".join([ROBOT, *tables(MissionConfig().robot, "robot.", documented=(LidarConfig,))])
+    return "\n".join([ROBOT, table(MissionConfig().robot, "robot.", documented=(LidarConfig,))])
 
 
 def lidar_page() -> str:
     """The settings of LiDAR SLAM on a robot."""
-    return "\n".join([LIDAR, *tables(MissionConfig().robot.lidar, "robot.lidar.")])
+    return "\n".join([LIDAR, table(MissionConfig().robot.lidar, "robot.lidar.")])
 
 
 def training_page() -> str:
     """The settings of training."""
-    federated = tables(FederatedSettings(), documented=(TrainingSettings,))
-    live = tables(FleetLearningSettings(), documented=(FederatedSettings,))
+    federated = table(FederatedSettings(), documented=(TrainingSettings,))
+    live = table(FleetLearningSettings(), documented=(FederatedSettings,))
     rounds, defaults = FleetLearningSettings().federated, FederatedSettings()
     changed = [
         row(f"{prefix}{key}", field, getattr(mine, key))
@@ -174,10 +174,8 @@ def training_page() -> str:
         for key, field in type(mine).model_fields.items()
         if getattr(mine, key) != getattr(other, key) and not isinstance(getattr(mine, key), Settings)
     ]
-    head = "| key | default | allowed | effect |\n|---|---|---|---|"
-    live_tables = [LEARNING, *live, "\n".join([head, *changed, ""])]
-    robot = [LEARNING_ROBOT, *tables(RobotLearningSettings())]
-    return "\n".join([TRAINING, *tables(TrainingSettings()), FEDERATED, *federated, *live_tables, *robot])
+    parts = [TRAINING, table(TrainingSettings()), FEDERATED, federated, LEARNING, live, *HEADER, *changed, ""]
+    return "\n".join([*parts, LEARNING_ROBOT, table(RobotLearningSettings())])
 
 
 PAGES: dict[Path, Callable[[], str]] = {
@@ -185,21 +183,24 @@ PAGES: dict[Path, Callable[[], str]] = {
 }
 
 
-def tables(settings: Settings, path: str = "", documented: tuple[type[Settings], ...] = ()) -> Iterator[str]:
-    """The class, one table of the plain keys of ``settings``, and after it those of the settings nested in it."""
-    rows, nested = [], []
+def table(settings: Settings, path: str = "", documented: tuple[type[Settings], ...] = ()) -> str:
+    """The classes and the keys of ``settings`` and of those nested in them, but the ``documented`` ones."""
+    found = list(keys_of(settings, path, documented))
+    places = dict.fromkeys(place_of(kind) for kind, _ in found)
+    return "\n".join([f"In the code: {'; '.join(places)}.", "", *HEADER, *(line for _, line in found), ""])
+
+
+def keys_of(settings: Settings, path: str, documented: tuple[type[Settings], ...]) -> Iterator[tuple[type, str]]:
+    """Class and line of each key; nested settings follow the plain keys."""
+    nested = []
     for key, field in type(settings).model_fields.items():
         value = getattr(settings, key)
         if not isinstance(value, Settings):
-            rows.append(row(f"{path}{key}", field, value))
+            yield type(settings), row(f"{path}{key}", field, value)
         elif not isinstance(value, documented):
-            nested.append((key, field, value))
-    if rows:
-        yield f"In the code: {place_of(type(settings))}.\n"
-        yield "\n".join(["| key | default | allowed | effect |", "|---|---|---|---|", *rows, ""])
-    for key, field, value in nested:
-        yield f"### `{path}{key}`\n\n{sentence(field.description)}\n"
-        yield from tables(value, f"{path}{key}.", documented)
+            nested.append((value, f"{path}{key}."))
+    for value, inner in nested:
+        yield from keys_of(value, inner, documented)
 
 
 def place_of(kind: type) -> str:
