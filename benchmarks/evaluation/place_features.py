@@ -17,14 +17,14 @@ from fcslam.cloud.settings import FleetConfig
 from fcslam.compiled import njit
 from fcslam.errors import FeatureError, InputError
 from fcslam.features.classical import Orb
-from fcslam.features.codes import code_words, hamming_matrix, mutual_matches
+from fcslam.features.codes import LARGEST_HAMMING, code_words, hamming_matrix, mutual_matches
 from fcslam.features.detector import FeatureDetector, ImageFeatures, OnnxConfig, OnnxDetector
 from fcslam.features.detector_kinds import DetectorKind
 from fcslam.features.files import extract, find_files, read_features, read_grey
 from fcslam.lidar.lost import LostConfig
 from fcslam.places.index import PlaceIndex
 from fcslam.places.kmeans_tree import Tree, TreeShape, find_leaves, grow_tree
-from fcslam.places.motions import LARGEST_HAMMING, rigid_hypotheses
+from fcslam.places.motions import rigid_hypotheses
 from fcslam.places.similarity import BagOfWords
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import Channel, Codes, FloatArray, Keyscan, Place, frozen

@@ -1,7 +1,7 @@
 """OpenCV's ORB, and the choice between it and the network: its descriptors are binary too."""
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,20 +22,13 @@ from fcslam.records import FloatArray, frozen
 ORB_VERSION = "orb-1"
 """Changes whenever the same image would give other descriptors."""
 
-_PYRAMID_STEP: Final = 1.2
-"""Scale factor between two levels of ORB's pyramid, OpenCV's default."""
-PYRAMID_LEVELS = 8
-"""Levels of ORB's image pyramid, each 1.2 times coarser than the one before."""
-
 
 class Orb:
     """Oriented FAST corners with rotated BRIEF codes (Rublee et al. 2011)."""
 
     def __init__(self, most_features: int = 300, fast_threshold: int = 7) -> None:
         """``fast_threshold``: smallest contrast of a FAST corner, in grey levels of 255; low for dim light."""
-        self._orb = cv2.ORB.create(
-            nfeatures=most_features, scaleFactor=_PYRAMID_STEP, nlevels=PYRAMID_LEVELS, fastThreshold=fast_threshold
-        )
+        self._orb = cv2.ORB.create(nfeatures=most_features, fastThreshold=fast_threshold)
 
     @property
     def version(self) -> str:
@@ -49,7 +42,7 @@ class Orb:
             return NO_FEATURES
         positions, responses = positions_and_responses(keypoints)
         # OpenCV multiplies positions by the scale of the level, which shifts pixel centres by half the difference.
-        scales = _PYRAMID_STEP ** np.array([keypoint.octave for keypoint in keypoints])
+        scales = self._orb.getScaleFactor() ** np.array([keypoint.octave for keypoint in keypoints])
         found, order = ranked(positions + 0.5 * (scales[:, None] - 1.0), responses)
         return ImageFeatures(found.keypoints_px, found.scores, frozen(descriptors[order], np.uint8))
 

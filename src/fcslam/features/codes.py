@@ -27,6 +27,10 @@ _UNMATCHED = np.uint32(0xFFFFFFFF)
 """Match key of a code without a neighbour."""
 
 
+LARGEST_HAMMING = 60
+"""Largest Hamming distance of two matching descriptors, bits."""
+
+
 class Matches(NamedTuple):
     """Matched codes of two sets."""
 

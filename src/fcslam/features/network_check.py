@@ -23,7 +23,7 @@ from fcslam.untrusted import read_bytes
 MOST_FILE_BYTES: Final = 1 << 26
 MOST_NODES: Final = 2000
 MOST_ATTRIBUTES: Final = 20 * MOST_NODES
-MOST_ELEMENTS: Final = 1 << 24
+MOST_ELEMENTS: Final = MOST_FILE_BYTES // 4
 """Numbers in one array of weights."""
 TRIAL_MEMORY_BYTES: Final = 400_000_000
 """Memory of a run on an image of ``TRIAL_SHAPE``; the paper's network needs 60 MB."""

@@ -16,26 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from fcslam.features.codes import hamming_matrix
+from fcslam.features.codes import LARGEST_HAMMING, hamming_matrix
 from fcslam.features.detector import GreyImage, ImageFeatures
 from fcslam.features.lidar_depth import LidarView, locate_among, project
 from fcslam.geometry import se2
-from fcslam.learning.homography import BORDER_PX
+from fcslam.learning.homography import BORDER_PX, CORRECT_PX
 from fcslam.records import CameraModel, FloatArray
 
 SAME_SURFACE_M: Final = 0.15
 """Largest distance, seen from above, between a point and the surface that the other view shows in its direction."""
 SEARCH_PX: Final = 12.0
 """Largest distance between a predicted pixel and a keypoint that may be the same point, before the correction."""
-ALIKE_BITS: Final = 60
-"""Codes that differ in at most this many bits tell how far the predicted pixels are off."""
-FEWEST_ALIKE: Final = 5
-"""Fewest such keypoints; two views with fewer give no correspondences."""
 NEIGHBOURS: Final = 9
-"""Keypoints over which the correction is a median."""
-AGREEMENT_PX: Final = 3.0
+"""Keypoints with like codes over which the correction of the predicted pixels is a median."""
+FEWEST_ALIKE: Final = NEIGHBOURS // 2 + 1
+"""Fewest such keypoints; two views with fewer give no correspondences."""
 AGREEING: Final = 0.5
-"""Least share of the keypoints with like codes whose own offset is within ``AGREEMENT_PX`` of the correction."""
+"""Least share of the keypoints with like codes whose own offset is within ``CORRECT_PX`` of the correction."""
 SNAP_PX: Final = 2.0
 """Largest distance between a corrected pixel and the keypoint that is the same point."""
 
@@ -111,7 +108,7 @@ def correspond_predicted(
         return none
     correction = _local_medians(pixels[sources], offsets, pixels[asked])
     own = _local_medians(pixels[sources], offsets, pixels[sources])
-    if np.mean(np.hypot(*(offsets - own).T) <= AGREEMENT_PX) < AGREEING:
+    if np.mean(np.hypot(*(offsets - own).T) <= CORRECT_PX) < AGREEING:
         return none
     corrected = pixels[asked] + correction
     distances, nearest = map(np.asarray, cKDTree(others).query(corrected, distance_upper_bound=SNAP_PX))
@@ -144,10 +141,10 @@ def _offsets_of_alike(
     """Offsets, (N, 2), and numbers of the keypoints with a like code near their predicted pixel."""
     distances = hamming_matrix(first.descriptors[asked], second.descriptors).astype(np.int64)
     gaps = others[None, :] - pixels[asked, None]
-    distances[np.hypot(gaps[..., 0], gaps[..., 1]) > SEARCH_PX] = ALIKE_BITS + 1
+    distances[np.hypot(gaps[..., 0], gaps[..., 1]) > SEARCH_PX] = LARGEST_HAMMING + 1
     best, back = np.argmin(distances, axis=1), np.argmin(distances, axis=0)
     rows = np.arange(len(asked))
-    rows = rows[(distances[rows, best] <= ALIKE_BITS) & (back[best] == rows)]
+    rows = rows[(distances[rows, best] <= LARGEST_HAMMING) & (back[best] == rows)]
     return gaps[rows, best[rows]], asked[rows]
 
 

@@ -42,8 +42,8 @@ CLOSURE_PATH_M = 1.0
 """Path length that crossing an accepted closure counts as, metres: a closure is not exact."""
 
 CONCLUSIVE_OVERLAP = 0.4
-"""Least overlap of a closure that is accepted after a wide search without support, nearer to its prediction than to the
-edge of the drift allowance."""
+"""Least overlap of two submaps that decides alone: of a closure that is accepted after a wide search without support,
+nearer to its prediction than to the edge of the drift allowance, and of a robot that leaves a cabin."""
 MINIMUM_SUPPORT = 3.0
 """Sum of ``Verification.support`` that consistent pending closures need."""
 MINIMUM_SPREAD_M = MINIMUM_SUPPORT

@@ -20,8 +20,10 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
+from fcslam.lidar.closing import CONCLUSIVE_OVERLAP
 from fcslam.lidar.evidence import CORRELATED, LEAST_KNOWN
 from fcslam.lidar.field import SurfelField
+from fcslam.lidar.first_motion import LONGEST_GAP_S
 from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.odometry import FIRST_MATCHES, OdometryModel, OdometryTrust, odometry_error
@@ -46,15 +48,15 @@ LOST_EXPLAINED = 0.60
 larger."""
 LOST_VIOLATION = 0.30
 """A lost robot sees a larger share of its points in known area in free space."""
-RODE, RODE_OVERLAP = 0.73, 0.40
+RODE = 0.73
 """A robot that leaves a closed cabin on another floor sees a smaller share on a surface, less the share in free space.
-The cabin says where its door is, so a part of the walls decides; but a larger share of them lies in known area."""
+The cabin says where its door is, so a part of the walls decides; but more of them lie in known area."""
 LEAST_OVERLAP = VERIFICATION.loose.overlap
 """Least share of all points in known area; below it, nothing is decided."""
 STAYED_M, LARGEST_SPEED, REACHABLE_S = 1.0, 2.0, 5.0
 """Without odometry, a robot is looked for within so many metres, and so many more for each second of a gap in the
 scans, m/s. After a longer gap, in seconds, that would be another room with the same walls: it must be where it was."""
-SEEN_S = 2.0
+SEEN_S = 2.0 * LONGEST_GAP_S
 """After a shorter gap, in seconds, a robot that is found nowhere counts as where it was: a match finds it again."""
 GAP_TRAVEL_M = 2.0 * DOUBTFUL_TRAVEL_M
 """``DOUBTFUL_TRAVEL_M`` after a gap, metres: more walls fit in fewer ways."""
@@ -121,7 +123,7 @@ def is_lost(scans: Sequence[LaserScan], frontend: LidarFrontend, closed_s: float
     T_local_first = frontend.localize(scans[0]).tracked.T_local_base
     worse = _agreement_at(T_local_first, frontend, fresh, math.inf if closed_s is None else closed_s)
     if closed_s is not None:
-        return worse.overlap >= RODE_OVERLAP and worse.explained - worse.violation < RODE
+        return worse.overlap >= CONCLUSIVE_OVERLAP and worse.explained - worse.violation < RODE
     return worse.overlap >= LEAST_OVERLAP and worse.explained < LOST_EXPLAINED and worse.violation > LOST_VIOLATION
 
 

@@ -32,7 +32,7 @@ CLEAR_RATIO = 0.05
 beams that graze a wall hit its cells seldom, too."""
 CLEARANCE_CELLS = 2.0
 """A beam without return ends this far before the line between the returns beside it, which may be one surface."""
-SETTLED_PASSES = 1_000_000
+SETTLED_PASSES = int(np.iinfo(np.uint32).max) // 2
 """Beams that each known cell of a finished map counts for: newer scans change it only if they contradict it."""
 
 

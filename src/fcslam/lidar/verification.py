@@ -13,7 +13,7 @@ from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import Agreement, Submap, agreement
 from fcslam.records import FloatArray, Reason, ReasonCode
 
-UNFIXED = 1e-2, 1e-2, 1e-2
+UNFIXED = 1e-2
 """Information in a direction that no point fixes: a standard deviation of 10 m or 10 rad."""
 ALIGNED_POINTS = 400
 """Least number of aligned points of a submap; smaller submaps align all their points."""
@@ -149,7 +149,9 @@ def align(a: Submap, b: Submap, T_a_b_guess: FloatArray, prior: FloatArray = NO_
         max(side.overlap for side in sides),
         worse.normal_tensor,
     )
-    information = limited_information(forward.information + prior, float(T_a_b[2]), UNFIXED, LEAST_VARIANCE)
+    information = limited_information(
+        forward.information + prior, float(T_a_b[2]), (UNFIXED, UNFIXED, UNFIXED), LEAST_VARIANCE
+    )
     return Aligned(T_a_b, information, worse, gap)
 
 

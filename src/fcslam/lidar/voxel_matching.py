@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fcslam.compiled import njit
 from fcslam.geometry import se3
 from fcslam.geometry.groups import SE3
-from fcslam.lidar.verification import CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
+from fcslam.lidar.verification import CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD, UNFIXED
 from fcslam.records import FloatArray, Reason, ReasonCode, VoxelMap
 
 _NEIGHBOURS: Final = 16
@@ -35,8 +35,6 @@ _GRID: Final = (128, 128, 48), (-12.8, -12.8, -3.2)
 """Cells of free space, and the lowest corner."""
 _SIGMA_M: Final = 0.5
 """Standard deviation of a point across its surface, for the information: those of neighbours are correlated."""
-_UNFIXED: Final = 1e-2
-"""Information in a direction that no surface fixes."""
 LEAST_SHARE, LARGEST_VIOLATION, LEAST_POINTS = 0.75, 0.06, 600
 """Of points in known space: least share on surfaces, largest share in free space, and least number on surfaces."""
 
@@ -133,7 +131,7 @@ def align_maps(a: PreparedMap, b: PreparedMap, T_a_b: FloatArray) -> tuple[Float
     unit = SE3.sigmas(CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD)
     scaled = hessian * (len(b.planes) / max(1, len(sample)) / _SIGMA_M**2) * np.outer(unit, unit)
     values, axes = np.linalg.eigh(scaled)
-    values = np.clip(values, _UNFIXED * CLOSURE_SIGMA_RAD**2, 1.0)
+    values = np.clip(values, UNFIXED * CLOSURE_SIGMA_RAD**2, 1.0)
     information = (axes * values) @ axes.T / np.outer(unit, unit)
     return T_a_b, np.asarray(0.5 * (information + information.T), np.float64)
 

@@ -20,7 +20,7 @@ from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
 from fcslam.lidar.submap import Submap, agreement
 from fcslam.lidar.verification import NO_PRIOR, VERIFICATION, Verification
 from fcslam.places.index import PlaceIndex, QueryResult
-from fcslam.places.motions import DISTINCT_M, Motion, propose_motions
+from fcslam.places.motions import DISTINCT_M, DISTINCT_RAD, Motion, propose_motions
 from fcslam.places.similarity import PAPER_SCALE
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, ClosureStatus, FloatArray, KeyscanId, LoopClosure, Place, Reason, ReasonCode, frozen
@@ -50,8 +50,6 @@ class MatchDecision(StrEnum):
 ALIGNED_CANDIDATES = 2
 """Most similar places of other robots in the same map that are compared although the map puts them elsewhere, to find
 evidence against the join."""
-TOLERANCE_RAD = 0.3
-"""Largest angle at which an image motion confirms a predicted pose, radians; the distance is ``DISTINCT_M``."""
 
 
 class MatcherConfig(Settings):
@@ -382,7 +380,7 @@ class PlaceMatcher:
 
     def _confirms(self, motion: Motion, T_i_j: FloatArray) -> bool:
         off = se2.between(T_i_j, motion.T_a_b)
-        return bool(np.hypot(off[0], off[1]) <= DISTINCT_M and abs(off[2]) <= TOLERANCE_RAD)
+        return bool(np.hypot(off[0], off[1]) <= DISTINCT_M and abs(off[2]) <= DISTINCT_RAD)
 
     def _verified(
         self, comparisons: Sequence[_Comparison], place: Place, result: QueryResult[KeyscanId]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.compiled import njit
-from fcslam.features.codes import Matches, mutual_matches
+from fcslam.features.codes import LARGEST_HAMMING, Matches, mutual_matches
 from fcslam.geometry import se2
 from fcslam.records import Channel, FloatArray, Place, frozen
 
@@ -27,14 +27,12 @@ MINIMUM_INLIERS = 4
 MOST_HYPOTHESES = 2
 """Most motion hypotheses of a pair of places."""
 DISTINCT_M = 1.0
-"""Distance of two motion hypotheses, in metres, from which on they are distinct."""
+"""Distance of two motions, in metres, from which on they are distinct."""
 DISTINCT_RAD = 0.26
-"""Angle between two motion hypotheses, in radians, from which on they are distinct."""
+"""Angle between two motions, in radians, from which on they are distinct."""
 INDEPENDENT_KEYPOINTS: Final = 10
 """Most independent keypoints of one image. The errors of its keypoints are correlated, because they share one scan and
 one robot pose, so more keypoints do not add information."""
-LARGEST_HAMMING = 60
-"""Largest Hamming distance of two matching descriptors, bits."""
 LEAST_INLIERS = 8
 """Fewest inliers of a motion that the submaps then verify."""
 LARGEST_LEVEL_M = 0.1

@@ -19,12 +19,12 @@ from fcslam.config import Settings
 from fcslam.errors import FeatureError
 from fcslam.features.birdseye import DETECTOR_VERSION, Features
 from fcslam.features.birdseye import describe as describe_surface
-from fcslam.features.codes import mutual_matches
+from fcslam.features.codes import LARGEST_HAMMING, mutual_matches
 from fcslam.geometry import se2
 from fcslam.lidar.backend import FinishedSubmap, LidarBackend
 from fcslam.lidar.frontend import LidarConfig, MappedKeyscan, ScanPose
 from fcslam.places.index import PlaceIndex
-from fcslam.places.motions import LARGEST_HAMMING, LEAST_INLIERS, rigid_hypotheses
+from fcslam.places.motions import LEAST_INLIERS, rigid_hypotheses
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import (
     PLACE_CHANNELS,

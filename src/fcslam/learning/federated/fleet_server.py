@@ -23,7 +23,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
-from fcslam.learning.federated.fleet_grid import FleetGrid
+from fcslam.learning.federated.fleet_grid import ONLINE_S, FleetGrid
 
 PATH: Final = "/api/v1/robots/{robot}/learning"
 NUMBER_HEADER: Final = "x-fcslam-request"
@@ -35,7 +35,7 @@ MAX_OPEN_REQUESTS: Final = 4
 """Requests of one robot at the same time."""
 MAX_UNWANTED_BYTES: Final = 64 * 2**20
 """A robot that is still sending would not see an answer, so a reply that comes too late is read to here."""
-ANSWER_S: Final = 60.0
+ANSWER_S: Final = ONLINE_S
 """Time for the answer to a request."""
 RETRY_S: Final = 3.0
 """Time after which something is tried again."""

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fcslam.features.codes import mutual_matches
+from fcslam.features.codes import LARGEST_HAMMING, mutual_matches
 from fcslam.features.detector import ImageFeatures, OnnxConfig
 from fcslam.geometry import se2
 from fcslam.learning.network import KeypointNetwork
 from fcslam.learning.revisits import Keyframe, correspond, revisits_in_map
 from fcslam.learning.validation import detect
-from fcslam.places.motions import LARGEST_HAMMING, level_matches, rigid_hypotheses
+from fcslam.places.motions import level_matches, rigid_hypotheses
 from fcslam.records import FloatArray, frozen
 
 COLUMNS: Final = ("revisit_recall", "places_found")

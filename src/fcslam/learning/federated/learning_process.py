@@ -16,7 +16,8 @@ from fcslam.records import FloatArray
 from fcslam.robot.keyframe_folder import KEYFRAMES
 
 STANDS_AFTER_S: Final = 10.0
-MOVED_M, MOVED_RAD = 0.05, 0.05
+MOVED_M = 0.05
+MOVED_RAD = MOVED_M
 """Largest displacement of a robot that stands; matched scans and corrections move its pose by less."""
 STOP_S: Final = 5.0
 NOTICE: Final = "notice"
