@@ -52,7 +52,7 @@ def spiral(seed: int, steps: int, false: int = 0) -> tuple[PoseGraph, np.ndarray
 
 
 def pose3(T: np.ndarray) -> gtsam.Pose3:
-    return gtsam.Pose3(se3.matrix(T))
+    return gtsam.Pose3(gtsam.Rot3(se3.rotation(T)), T[:3])
 
 
 def gtsam_optimum(graph: PoseGraph, loss: Loss) -> tuple[np.ndarray, float]:

@@ -124,6 +124,8 @@ def test_odometry_in_a_map_is_left_for_any_other(tmp_path):
     for name, others in (("topic", drive(20)), ("tf", [*readings_in_tf(drive(20)), *without(drive(20), "/odom")])):
         source = open_source(save(tmp_path / f"{name}.bag", [*corrected, *others]))
         assert scans_of(source)[0].T_odom_base[0] < 1.0
+    leaps = [odom(100.0 + 0.02 * k, (9.0 * (k % 60 > 30), 0.0, 0.0), "/a/odom") for k in range(200)]
+    assert scans_of(open_source(save(tmp_path / "leaps.bag", [*leaps, *drive(20)])))[0].T_odom_base[1] != 0.0
     alone = open_source(save(tmp_path / "alone.bag", [*corrected, *without(drive(20), "/odom")]))
     assert scans_of(alone)[0].T_odom_base[0] == 9.0
 

@@ -57,14 +57,6 @@ def rotation(T_a_b: ArrayLike) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def matrix(T_a_b: ArrayLike) -> Array:
-    """Homogeneous matrix of the pose, shape (..., 4, 4)."""
-    pose = _pose(T_a_b)
-    homogeneous = np.zeros((*pose.shape[:-1], 4, 4))
-    homogeneous[..., :3, :3], homogeneous[..., :3, 3], homogeneous[..., 3, 3] = rotation(pose), pose[..., :3], 1.0
-    return homogeneous
-
-
 def from_matrix(homogeneous: ArrayLike) -> Array:
     """Pose of a homogeneous matrix (..., 4, 4), shape (..., 7)."""
     m = np.asarray(homogeneous, dtype=np.float64)
@@ -170,12 +162,6 @@ def shift_m(T_a_b: ArrayLike) -> Any:
 def turn_rad(T_a_b: ArrayLike) -> Any:
     """Angle of the rotation, radians, shape (...)."""
     return 2.0 * np.arccos(np.clip(np.abs(np.asarray(T_a_b, dtype=np.float64)[..., 6]), 0.0, 1.0))
-
-
-def relative(poses: ArrayLike) -> Array:
-    """Motions between consecutive poses of a chain: (N, 7) to (N - 1, 7)."""
-    chain = _pose(poses)
-    return between(chain[:-1], chain[1:])
 
 
 def _pose(values: ArrayLike) -> Array:

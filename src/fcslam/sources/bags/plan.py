@@ -1,8 +1,8 @@
 """Decides once, before a bag is read, which of its topics and frames are read, and how."""
 
 from collections.abc import Iterator, Sequence
-from itertools import chain, islice
-from math import tau
+from itertools import chain, islice, pairwise
+from math import dist, tau
 from typing import NamedTuple
 
 from fcslam.config import one_line
@@ -23,7 +23,9 @@ from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
 from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree, is_corrected
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.gate import FIRST_MESSAGES
+from fcslam.sources.motion import LARGEST_SPEED
 from fcslam.sources.path_summary import fault_of_odometry, without_odometry
+from fcslam.sources.returns import is_apart
 
 _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
@@ -110,7 +112,9 @@ class _Planner:
     def __init__(self, robot: BagRobot, options: BagOptions) -> None:
         self._robot, self._options, self._bag, self._path = robot, options, robot.bag, robot.bag.path
         known = KnownTopics(robot.topics, robot.transforms, f"{robot.bag.path}: ")
-        self._topics = choose_topics(known, options, self._view_rad, self._jumps)
+        self._topics = choose_topics(
+            known, options, self._view_rad, lambda topic: self._jumps(topic) or self._leaps(topic)
+        )
         self._tree = robot.bag.tree(robot.transforms)
         self._scans = BagScans(robot, self._topics.scans, options, self._tree, self._base_frame_of)
         self._notes: list[str] = []
@@ -246,6 +250,15 @@ class _Planner:
     def _jumps(self, topic: Topic) -> bool:
         frames = self._bag.census[topic].odom_frames
         return bool(frames) and all(map(is_corrected, frames))
+
+    def _leaps(self, topic: Topic) -> bool:
+        """Whether poses are farther apart than a robot drives, as where a map corrects them."""
+        readings = valid(self._bag.read([topic]), lambda message: message.content)
+        return any(
+            is_apart(a.T_odom_base, b.T_odom_base)
+            and dist(a.T_odom_base[:2], b.T_odom_base[:2]) > LARGEST_SPEED * abs(b.stamp - a.stamp)
+            for a, b in pairwise(readings)
+        )
 
     def _view_rad(self, topic: Topic) -> float:
         if topic.type not in LASER_SCANS:

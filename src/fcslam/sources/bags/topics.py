@@ -104,7 +104,9 @@ def choose_topics(
     camera, camera_info, notes = _choose_camera(known, options.camera_topic)
     if not options.scan_topics:
         notes = [*_note(known, "laser scans", "--sensors scan-topic", lasers[0], scans), *notes]
-    if measured := [topic for topic in odometries if topic.type == ODOMETRY]:
+    measured = [topic for topic in odometries if topic.type == ODOMETRY]
+    odometries = measured or odometries
+    if len(measured) > 1:
         odometries = [
             min(
                 measured,
