@@ -94,8 +94,8 @@ class Contradiction(NamedTuple):
         if self.facing == AS_STATED:
             return (
                 f"the scans contradict the odometry: only {100 * self.stated_agreement:.0f} % of the points agree, and "
-                "no other mounting is certain; check the mounting, that the ranges are distances in metres and in the "
-                "order of their beams, and that both are of one robot"
+                "no other mounting is certain; check the mounting, the times of the beams, that the ranges are "
+                "distances in metres and in the order of their beams, and that both are of one robot"
             )
         claims = []
         if upside_down:

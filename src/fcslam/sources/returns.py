@@ -19,7 +19,6 @@ import numpy as np
 from fcslam.errors import SourceError
 from fcslam.records import FloatArray, LaserScan, Ranges, frozen
 from fcslam.sources.faults import FEWEST
-from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.pose import Pose
 
 FEWEST_RETURNS = 0.02
@@ -76,37 +75,29 @@ class _Sample(NamedTuple):
     values: Ranges
     range_min_m: float
     range_max_m: float
-    is_elsewhere: bool
-    """Whether the robot has moved since the sample before."""
+    T_odom_base: Pose
 
 
 class RangeSample:
     """Samples of the scans of one laser, spread over its recording."""
 
-    def __init__(self) -> None:
+    def __init__(self, count: int) -> None:
+        """``count`` scans are recorded, about."""
         self._samples: list[_Sample] = []
-        self._last: Pose | None = None
-        self._seen, self._step = 0, 1
-
-    def wants(self, T_odom_base: Pose) -> bool:
-        """Whether to add the next scan."""
-        if self._last is not None and self._seen >= FIRST_MESSAGES and not is_apart(self._last, T_odom_base):
-            return False
-        self._seen += 1
-        return self._seen % self._step == 0
+        self._seen, self._step = 0, 1 + count // _KEPT
 
     def add(self, T_odom_base: Pose, values: Ranges, range_min_m: float, range_max_m: float) -> None:
-        """Add a scan that is wanted, with its values as sent and the ranges that are returns."""
-        is_elsewhere = self._last is not None and is_apart(self._last, T_odom_base)
-        if self._last is None or is_elsewhere:
-            self._last = T_odom_base
-        self._samples.append(_Sample(values, range_min_m, range_max_m, is_elsewhere))
-        if len(self._samples) > _KEPT:
-            self._samples, self._step = self._samples[::2], 2 * self._step
+        """Add the next scan, with its values as sent and the ranges that are returns."""
+        if self._seen % self._step == 0:
+            self._samples.append(_Sample(values, range_min_m, range_max_m, T_odom_base))
+        self._seen += 1
 
     def placeholders(self) -> tuple[float, ...]:
         """The values that are not ranges."""
-        places = [sample for sample in self._samples if sample.is_elsewhere]
+        places = self._samples[:1]
+        for sample in self._samples:
+            if is_apart(places[-1].T_odom_base, sample.T_odom_base):
+                places.append(sample)
         beams = sum(len(sample.values) for sample in places)
         if len(places) < FEWEST:
             return ()

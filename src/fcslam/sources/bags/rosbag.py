@@ -178,7 +178,7 @@ class RosBag:
         audit, errors, plan = _audit(), dict[str, str](), self.plan
         tree, lasers = plan.tree, plan.lasers
         scans, odometry = PathSummary(), PathSummary()
-        samples = [RangeSample() for _ in lasers]
+        samples = [RangeSample(laser.topic.message_count) for laser in lasers]
         farthest_m = [laser.first.range_max_m for laser in lasers]
         base_frame = self.options.base_frame or ""
         for topic in plan.topics.transforms:
@@ -188,12 +188,10 @@ class RosBag:
                 audit.add(Fault.BROKEN_MESSAGE, census.first_broken, census.broken)
         for _, entry in self._entries(audit, errors):
             if isinstance(entry, PosedScan):
-                laser = entry.scan.laser
-                farthest_m[laser] = max(farthest_m[laser], entry.scan.range_max_m)
-                if (sample := samples[laser]).wants(entry.T_odom_base):
-                    scan = entry.scan
-                    sample.add(entry.T_odom_base, scan.raw_ranges_m, scan.range_min_m, scan.range_max_m)
-                scans.add(entry.scan.stamp, entry.T_odom_base)
+                scan, pose = entry.scan, entry.T_odom_base
+                farthest_m[scan.laser] = max(farthest_m[scan.laser], scan.range_max_m)
+                samples[scan.laser].add(pose, scan.raw_ranges_m, scan.range_min_m, scan.range_max_m)
+                scans.add(scan.stamp, pose)
             elif isinstance(entry, OdometryReading):
                 odometry.add(entry.stamp, entry.T_odom_base)
                 base_frame = base_frame or entry.base_frame

@@ -88,7 +88,13 @@ class CarmenLog:
 
     @cached_property
     def _reading(self) -> _Reading:
-        path, log, audit, sample, driven = self._path, self._log, Audit(), RangeSample(), PathSummary()
+        path, log, audit, sample, driven = (
+            self._path,
+            self._log,
+            Audit(),
+            RangeSample(len(self._log.stamps)),
+            PathSummary(),
+        )
         if not log.stamps:
             list(self._consistent(Beams(0, 0.0, 0.0), audit))
             seen = f"; {audit.faults()}" * bool(audit.faults())
@@ -100,9 +106,7 @@ class CarmenLog:
             if k in log.untimed:
                 audit.add(Fault.NO_STAMP, number)
             T_odom_base, stated = pose_of(log.T_odom_base[k]), log.stated[k]
-            if sample.wants(T_odom_base):
-                max_range_m = stated.max_range_m if stated is not None else SICK_MAX_RANGE_M
-                sample.add(T_odom_base, log.ranges_m[k], 0.0, max_range_m)
+            sample.add(T_odom_base, log.ranges_m[k], 0.0, SICK_MAX_RANGE_M if stated is None else stated.max_range_m)
             driven.add(log.stamps[k], T_odom_base)
             admitted.append(k)
         faults, scan_count, duration_s = audit.faults(), driven.count, driven.duration_s
