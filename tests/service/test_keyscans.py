@@ -45,6 +45,14 @@ def test_a_session_without_packets_stays_where_it_was_drawn_and_sees_nothing(sto
     assert len(live_scan(store, "z", 0)) == 0
 
 
+@pytest.mark.parametrize("at_s", [-5.0, 0.0, 7.4, 7.6, 99.0])
+def test_keyscans_and_motions_are_those_of_a_time(store, at_s):
+    stamps = np.arange(float(len(POSES)))
+    nearest = stamps[np.argsort(abs(stamps - at_s), kind="stable")[:4]]
+    assert [keyscan.stamp for keyscan in store.keyscans_near("a", 0, at_s, 4)] == nearest.tolist()
+    assert len(store.constraints_since("a", 0, at_s)) == np.sum(stamps[1:] >= at_s)
+
+
 def test_the_scan_is_the_newest_one(store):
     (newest,) = {*dequantise(np.full(1, 1000 + len(POSES) - 1, np.uint16)).tolist()}  # as ``tests.scripted`` draws it
     points = live_scan(store, "a", 0)

@@ -26,10 +26,18 @@ from fcslam.records import ClosureStatus, Constraint, ConstraintKind, FloorLabel
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
 from fcslam.service.joint_maps import read_joint_maps
-from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.mission_folder import KEPT, MissionFolder
 from fcslam.service.shared.files import RESULT
 from fcslam.service.supervisor import PROGRESS
-from fcslam.service.worker import AT_ONCE, MOST_CRASHES, QUALITY_EVERY_S, SNAPSHOT_EVERY_S, CrashLog, Worker
+from fcslam.service.worker import (
+    AT_ONCE,
+    LONGEST_COPY_S,
+    MOST_CRASHES,
+    QUALITY_EVERY_S,
+    SNAPSHOT_EVERY_S,
+    CrashLog,
+    Worker,
+)
 from fcslam.sources import open_source
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, read_label
@@ -494,6 +502,35 @@ def test_a_result_waits_for_the_packets_that_were_there_when_it_was_asked_for(cl
     assert ("finalized", number) in cloud.told
 
 
+def test_a_mission_keeps_its_newest_results(cloud):
+    cloud.put(two_robots()[:20])
+    for _ in range(KEPT + 2):
+        cloud.finalize()
+    assert {path.name for path in cloud.folder.run("1").parent.iterdir()} == {str(k + 3) for k in range(KEPT)}
+
+
+def test_a_copy_that_hangs_is_ended_and_its_output_comes_later(cloud):
+    class Hanging:
+        exitcode = None
+
+        def terminate(self):
+            self.exitcode = -signal.SIGTERM
+
+    copies = []
+
+    def start(task, niceness):
+        copies.append(Hanging() if len(copies) < 2 else InlineTask(task, niceness))
+        return copies[-1]
+
+    cloud.worker = Worker(cloud.folder, cloud.store, cloud.clock, lambda *_: None, start)
+    cloud.put(two_robots())
+    for _ in range(3):
+        cloud.work()
+        cloud.now += LONGEST_COPY_S
+    assert len(copies) >= 4
+    assert open_run(cloud.folder.live).trajectories.keys() == {"a", "b"}
+
+
 def test_a_map_is_drawn_while_packets_wait(cloud):
     cloud.put(two_robots())
     drawn = set()
@@ -525,7 +562,7 @@ def test_the_live_run_follows_and_its_certificate_is_computed_seldom_or_when_map
     assert set(json.loads(live.quality["quality.json"])) == {"0"}
     assert seen == sorted(seen)
     assert seen[-1] == 2 * len(POSES)
-    assert len(list((cloud.folder.path / "snapshots").iterdir())) <= 2
+    assert len(list((cloud.folder.path / "snapshots").iterdir())) <= KEPT
 
 
 def test_a_live_map_that_cannot_be_written_stops_nothing_and_comes_later(cloud):

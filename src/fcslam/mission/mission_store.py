@@ -35,7 +35,7 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.storage.database import Database, check_file, translate_errors
-from fcslam.storage.row_store import RowStore, StoreTable, Transaction, change_rows
+from fcslam.storage.row_store import RowStore, StoreTable, Transaction, all_rows, change_rows
 from fcslam.untrusted import check_unpacked, open_database, unpack
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import Hello, PacketKind
@@ -255,13 +255,23 @@ class MissionStore:
 
     def keyscans_near(self, robot: str, epoch: int, time: float, limit: int) -> list[Keyscan]:
         """At most ``limit`` keyscans of a session that it sent nearest to a time."""
-        where = "robot = ? AND epoch = ? AND kind = ? AND refusal IS NULL ORDER BY abs(time - ?) LIMIT ?"
-        return self._bodies(Keyscan, where, robot, epoch, PacketKind.KEYSCAN, time, limit)
+        where = "robot = ? AND epoch = ? AND kind = ? AND refusal IS NULL AND sequence"
+        values = robot, epoch, PacketKind.KEYSCAN, self._last_before(robot, epoch, time), limit
+        before = self._bodies(Keyscan, f"{where} <= ? ORDER BY sequence DESC LIMIT ?", *values)
+        since = self._bodies(Keyscan, f"{where} > ? ORDER BY sequence LIMIT ?", *values)
+        return sorted(before + since, key=lambda keyscan: abs(keyscan.stamp - time))[:limit]
 
     def constraints_since(self, robot: str, epoch: int, time: float) -> list[Constraint]:
         """Constraints of a session that it sent at this time or later, in their order."""
-        where = "robot = ? AND epoch = ? AND kind = ? AND time >= ? AND refusal IS NULL ORDER BY sequence"
-        return self._bodies(Constraint, where, robot, epoch, PacketKind.CONSTRAINT, time)
+        where = "robot = ? AND epoch = ? AND kind = ? AND sequence > ? AND refusal IS NULL ORDER BY sequence"
+        last = self._last_before(robot, epoch, time)
+        return self._bodies(Constraint, where, robot, epoch, PacketKind.CONSTRAINT, last)
+
+    def _last_before(self, robot: str, epoch: int, time: float) -> int:
+        """Number of the last packet of a session before a time, or -1, from the newest on: their times only grow."""
+        statement = "robot = ? AND epoch = ? AND time < ? ORDER BY sequence DESC LIMIT 1"
+        last = self._database.value(f"SELECT sequence FROM packets WHERE {statement}", (robot, epoch, time))
+        return -1 if last is None else int(last)
 
     def _bodies(self, kind: type[_Body], where: str, *values: Any) -> list[_Body]:
         rows = self._database.rows(f"SELECT data FROM packets WHERE {where}", values)
@@ -364,14 +374,12 @@ class MissionStore:
 
     def finalizations(self) -> list[Finalization]:
         """All requests, the oldest first."""
-        columns = "number, arrivals, edits, run, failure"
-        return [
-            Finalization(*row) for row in self._database.rows(f"SELECT {columns} FROM finalizations ORDER BY number")
-        ]
+        return [Finalization(*row) for row in self._database.rows(all_rows(FINALIZATIONS))]
 
     def finalization(self, number: int) -> Finalization:
         """One request, which exists."""
-        return next(asked for asked in self.finalizations() if asked.number == number)
+        statement = f"SELECT {', '.join(FINALIZATIONS.columns)} FROM finalizations WHERE number = ?"
+        return Finalization(*self._database.rows(statement, (number,))[0])
 
     def answer(self, number: int, run: str | None, failure: str | None = None) -> None:
         """Store the outcome of a request."""

@@ -4,7 +4,7 @@ detectors/<channel>/<version>.onnx   networks that robots may fetch
 missions/<name>/mission.sqlite       what was received: all that must not be lost
                 live/                the run folder of what is believed now
                 joint.maps           the grids and poses that robots get, drawn more often than the run folder
-                runs/<number>/       the run folders that were asked for
+                runs/<number>/       the newest run folders that were asked for
                 worker.state         the worker's state some packets ago, for a quick restart; may be deleted
                 worker.task          what the worker is doing, to refuse a packet that ends worker after worker
                 worker.lock          held by the mission's worker
@@ -19,6 +19,9 @@ from typing import Self
 
 from fcslam.runs import Run
 from fcslam.wire.checks import check_name
+
+KEPT = 4
+"""Newest live runs, and newest results, that a mission keeps."""
 
 
 class MissionFolder:
@@ -45,15 +48,18 @@ class MissionFolder:
         return self.path / "runs" / name
 
     def publish(self, run: Run) -> None:
-        """Make ``run`` the live one; the previous one stays for readers that have it open."""
+        """Make ``run`` the live one; those before it stay for a while, for readers that have them open."""
         snapshots = self.path / "snapshots"
-        before = int(self.live.resolve().name) if self.live.exists() else 0
-        name = str(before + 1)
+        name = str(int(self.live.resolve().name) + 1 if self.live.exists() else 1)
         run.save(snapshots / name, force=True)
         link = self.path / ".live.partial"
         link.unlink(missing_ok=True)
         link.symlink_to(Path("snapshots") / name, target_is_directory=True)
         os.replace(link, self.live)
-        for old in snapshots.iterdir():
-            if old.name not in (str(before), name):
-                shutil.rmtree(old, ignore_errors=True)
+        keep_newest(snapshots)
+
+
+def keep_newest(folder: Path) -> None:
+    """Remove all but the newest run folders, whose names are numbers."""
+    for old in sorted(int(run.name) for run in folder.iterdir() if run.name.isdecimal())[:-KEPT]:
+        shutil.rmtree(folder / str(old), ignore_errors=True)

@@ -46,7 +46,7 @@ from fcslam.mission.mission_store import CONFIG, Envelope, Finalization, Mission
 from fcslam.processes import NICENESS, Background, Start, emit_event, start_copy, trim_memory
 from fcslam.runs import QUALITY, Metric, Run
 from fcslam.service.joint_maps import joint_maps_of, write_joint_maps
-from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.mission_folder import MissionFolder, keep_newest
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SNAPSHOT, fetch_snapshot, put_file
 from fcslam.service.shared.mission_tables import Lease, LeaseLostError, MissionTables
 from fcslam.service.supervisor import PROGRESS, READY, WorkerTask
@@ -73,6 +73,8 @@ WRITE_EVERY_S = 0.5
 """Least time between two drawings of a map."""
 LONGEST_WAIT_S = 5.0
 """Longest time between two drawings of a map that lacks something, whatever they cost."""
+LONGEST_COPY_S = 1800.0
+"""A copy of the worker that writes for longer is ended."""
 MOST_CRASHES = 3
 """Consecutive workers that may end at one task; the next worker leaves the task out."""
 
@@ -389,6 +391,7 @@ class Worker:
             self._store.answer(asked.number, None, str(error) or type(error).__name__)
         else:
             self._store.answer(asked.number, name)
+            keep_newest(self._folder.run(name).parent)
         self._crashes.end()
         self._joint_maps.shown = self._live.shown = -1
         self._emit_event("finalized", asked.number)
@@ -408,6 +411,8 @@ class Worker:
         """
         if output.copy is not None:
             exitcode = output.copy.exitcode
+            if exitcode is None and self._clock() > output.began_s + LONGEST_COPY_S:
+                output.copy.terminate()  # it hangs, and another one is to write the output
             return exitcode is not None and self._end_writing(output, exitcode)
         is_new = output.shown != self._applied or (output is self._live and self._certifies())
         if not is_new or self._applied < self._resumed_at or self._clock() < output.due_s(is_busy):

@@ -12,8 +12,8 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import InputError, StoreError
 from fcslam.mission.mission_store import FACTS, TABLES, MissionStore, StoredPacket, check_mission
 from fcslam.records import Removal, Veto, frozen
-from fcslam.service.mission_folder import MissionFolder
-from fcslam.service.shared.files import SNAPSHOT, fetch_folder, fetch_snapshot, fetched, put_file
+from fcslam.service.mission_folder import KEPT, MissionFolder
+from fcslam.service.shared.files import RESULT, SNAPSHOT, fetch_folder, fetch_snapshot, fetched, put_file
 from fcslam.service.shared.mission_tables import LeaseLostError, MissionTables, insert_mission
 from fcslam.storage.postgres import Postgres
 from tests.full_disk import largest_file
@@ -159,6 +159,10 @@ def test_a_run_folder_travels_as_it_is(registry, postgres, tmp_path):
         assert (tmp_path / "seen" / "1" / path.relative_to(folder)).read_bytes() == path.read_bytes()
     (mission,) = registry.missions()
     assert mission.live == 1
+    for k in range(1, KEPT + 3):
+        put_file(postgres, lease, f"{RESULT}{k}", folder)
+    kept = [k for k in range(KEPT + 3) if fetched(postgres, number, f"{RESULT}{k}") is not None]
+    assert kept == list(range(3, KEPT + 3))
 
 
 def test_a_worker_begins_without_the_snapshot_for_which_its_disk_has_no_room(registry, postgres, tmp_path):

@@ -42,7 +42,7 @@ def administration_router(state: ServiceState) -> APIRouter:
         tags=["decisions"], dependencies=state.require(Role.ADMIN), responses=refusals(401, 403, 503, 507)
     )
 
-    @router.post("/finalize", responses=refusals(500))
+    @router.post("/finalize", responses=refusals(404, 500))
     async def finalize() -> Finalized:
         """Write the result of all packets that arrived as a run folder of the service; the response waits for it."""
         mission = await run_in_threadpool(lambda: state.mission)
@@ -51,8 +51,10 @@ def administration_router(state: ServiceState) -> APIRouter:
             asked = await run_in_threadpool(mission.store.finalization, number)
             if asked.failure:
                 raise HTTPException(500, asked.failure)
-            run = await run_in_threadpool(mission.result, asked.run) if asked.run else None
-            if run is not None:
+            if asked.run:
+                run = await run_in_threadpool(mission.result, asked.run)
+                if run is None:
+                    raise HTTPException(404, f"result {number} was removed, because there are several newer ones")
                 return Finalized(
                     number=number,
                     run=str(run),

@@ -8,7 +8,7 @@ from typing import Final
 
 from fcslam.records import Channel, DetectorFile
 from fcslam.service.detectors import DetectorStore
-from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.mission_folder import KEPT, MissionFolder
 from fcslam.service.shared.mission_tables import Lease, check_lease, schema_of
 from fcslam.storage.database import translate_errors
 from fcslam.storage.files import replacing_folder, write_file
@@ -38,6 +38,9 @@ def put_file(server: Postgres, lease: Lease, name: str, path: Path) -> None:
             "INSERT INTO files VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET content = excluded.content",
             (name, content),
         )
+        if name.startswith(RESULT):
+            old = [f"{RESULT}{number}" for number in range(int(name.removeprefix(RESULT)) - KEPT + 1)]
+            transaction.execute("DELETE FROM files WHERE name = ANY(?)", (old,))
         counted = "live" if name == LIVE else "finalized" if name.startswith(RESULT) else None
         if counted is not None:
             statement = f"UPDATE fcslam.missions SET {counted} = {counted} + 1 WHERE number = ?"

@@ -15,7 +15,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import InputError, StoreError
 from fcslam.mission.mission_store import MissionStore
 from fcslam.service.intake import AGENT_LEASE_S, Agents, Intake, held_by_another
-from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.mission_folder import MissionFolder, keep_newest
 from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, locked, sweep
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SharedDetectors, fetch_folder, fetched
 from fcslam.service.shared.instance import Instance
@@ -111,7 +111,7 @@ class SharedMission(OpenMission):
     def run_folder(self) -> Path | None:
         """The newest live run folder that a worker shared; None before the first one."""
         known = self._instance.known.get(self.name)
-        return None if known is None or not known.live else self._fetched(LIVE, str(known.live))
+        return None if known is None or not known.live else self._fetched(LIVE, LIVE, str(known.live))
 
     @property
     def joint_maps(self) -> Path:
@@ -131,23 +131,20 @@ class SharedMission(OpenMission):
 
     def result(self, name: str) -> Path | None:
         """As in ``OpenMission``."""
-        return self._fetched(f"{RESULT}{name}", f"result-{name}")
+        return self._fetched(f"{RESULT}{name}", "runs", name)
 
     def close(self) -> None:
         """Nothing: the instance stops its worker."""
 
-    def _fetched(self, name: str, local: str) -> Path | None:
+    def _fetched(self, name: str, kind: str, number: str) -> Path | None:
         """A shared run folder, which is fetched once."""
-        seen = self.folder.path / _SEEN
-        path = seen / local
+        path = self.folder.path / _SEEN / kind / number
         with self._fetching:
             if path.is_dir():
                 return path
             if not fetch_folder(self._server, self._number, name, path):
                 return None
-            if name == LIVE:  # those before the last one are no longer read
-                for old in sorted(int(one.name) for one in seen.iterdir() if one.name.isdecimal())[:-2]:
-                    shutil.rmtree(seen / str(old), ignore_errors=True)
+            keep_newest(path.parent)
         return path
 
 
