@@ -24,10 +24,6 @@ def load(path: Path):
     return module
 
 
-def test_there_are_benchmarks():
-    assert len(SCRIPTS) >= 8
-
-
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_the_docstring_names_the_command(path):
     docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))

@@ -4,6 +4,7 @@ import importlib.util
 import mmap
 import random
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,10 @@ import pytest
 from fcslam.config import one_line, parse_yaml
 from fcslam.errors import InputError, SourceError
 from fcslam.mission.localization import read_map
+from fcslam.wire.packets import encode
 from tests.fuzz.mutations import mutate
 from tests.fuzz.targets import TARGETS, attempt
+from tests.wire.examples import EXAMPLES
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
@@ -51,6 +54,16 @@ def test_every_target_reads_some_inputs_and_refuses_others(target, tmp_path):
         assert any(outcome is not first for outcome in outcomes)
         for seed in opened.seeds:
             opened.read(seed)
+
+
+@pytest.mark.slow
+def test_every_flip_of_one_bit_of_a_packet_is_read_or_refused(tmp_path):
+    with TARGETS["packets"](tmp_path) as opened:
+        for data in map(encode, EXAMPLES.values()):
+            for bit in range(8 * len(data)):
+                flipped = bytearray(data)
+                flipped[bit // 8] ^= 1 << bit % 8
+                attempt(partial(opened.read, bytes(flipped)))
 
 
 def test_an_exception_is_a_finding_with_the_command_that_repeats_it(fuzz, tmp_path, monkeypatch):

@@ -30,17 +30,13 @@ def figures(**found):
     return lambda reply: replace(reply, figures=found)
 
 
-ODD_FIGURES = {
+ODD = {
     "odd names": lambda reply: replace(reply, figures={"x\ny": 1.0}),
     "long names": figures(**{"x" * 1000: 1.0}),
     "NaN": figures(detector=float("nan")),
     "infinity": figures(detector=float("-inf")),
     "beyond measure": figures(detector=1e300),
     "many": figures(**{f"x{number}": 1.0 for number in range(1000)}),
-    "another robot": lambda reply: replace(reply, robot="good"),
-    "another version": lambda reply: replace(reply, version="light-0"),
-}
-ODD = ODD_FIGURES | {
     "no arrays": lambda reply: replace(reply, arrays={}),
     "large": lambda reply: replace(reply, arrays=reply.arrays | {"a.weight": np.zeros(100_000, np.float32)}),
 }
