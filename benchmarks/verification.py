@@ -111,10 +111,10 @@ def compared(count: int) -> list[list]:
 
     asked: list = []
 
-    def keep(pairs, config):
+    def keep(pairs):
         # The noise needs the scans of its mission, and is asked for too rarely to count.
         asked.extend(pair._replace(noise=lambda: 0.0) for pair in pairs)
-        return verify_here(pairs, config)
+        return verify_here(pairs)
 
     config = MissionConfig()
     fleet = Fleet(config.fleet, config.seed, keep)
@@ -129,10 +129,9 @@ def compared(count: int) -> list[list]:
 
 def timed(verify: Callable, executors: Sequence[Executor], batches: list[list]) -> tuple[float, float, list]:
     """Seconds, seconds of CPU of the busiest process, and what was found."""
-    from fcslam.lidar.verification import VerificationConfig
 
-    config, began, before_s = VerificationConfig(), time.perf_counter(), used(executors)
-    found = [check for batch in batches for check in verify(batch, config)]
+    began, before_s = time.perf_counter(), used(executors)
+    found = [check for batch in batches for check in verify(batch)]
     took_s = time.perf_counter() - began
     cpu_s = max(after - before for after, before in zip(used(executors), before_s, strict=True))
     return took_s, cpu_s, [(check.T_a_b.tobytes(), check.strict, check.loose) for check in found]

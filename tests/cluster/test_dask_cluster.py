@@ -23,7 +23,6 @@ from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import Pair, VerificationPool, verify_here
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.verification import VerificationConfig
 from fcslam.mission.mission_store import MissionStore
 from fcslam.service.credentials import make_cluster_credentials
 from fcslam.service.mission_folder import MissionFolder
@@ -36,7 +35,6 @@ from tests.waiting import wait_for
 
 pytestmark = [needs_dask, pytest.mark.slow]
 
-CONFIG = VerificationConfig()
 DIFFERENT = "whose sources or libraries differ from fcslam 0.1.0 here; install the same ones there"
 
 
@@ -56,7 +54,7 @@ def pairs():
 
 @pytest.fixture(scope="module")
 def expected(pairs):
-    return written(verify_here(pairs, CONFIG))
+    return written(verify_here(pairs))
 
 
 @pytest.fixture
@@ -75,24 +73,24 @@ def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(tmp_path, p
 
             def is_done_by_others(answers=1):
                 before = verify.answers
-                return written(verify(pairs, CONFIG)) == expected and verify.answers >= before + answers
+                return written(verify(pairs)) == expected and verify.answers >= before + answers
 
             wait_for(lambda: is_done_by_others(4))
 
             os.kill(one.pid, signal.SIGSTOP)  # it neither works nor ends
-            assert written(verify(pairs, CONFIG)) == expected
+            assert written(verify(pairs)) == expected
             one.kill()
-            assert written(verify(pairs, CONFIG)) == expected
-            assert written(verify(pairs[::-1], CONFIG)) == expected[::-1]
+            assert written(verify(pairs)) == expected
+            assert written(verify(pairs[::-1])) == expected[::-1]
             wait_for(lambda: len(workers.executors()) == 1)
             assert not warnings_of(), "a cluster may shrink"
 
             wait_for(is_done_by_others)
             cluster.scheduler.kill()
             for _ in range(3):
-                assert written(verify(pairs, CONFIG)) == expected
+                assert written(verify(pairs)) == expected
             wait_for(lambda: not workers.executors())
-            assert written(verify(pairs, CONFIG)) == expected
+            assert written(verify(pairs)) == expected
             (warning,) = wait_for(warnings_of)
             assert warning.startswith(f"the cluster {cluster.address} is gone")
 
@@ -132,7 +130,7 @@ def test_a_worker_of_another_version_is_refused_by_name(tmp_path, pairs, expecte
             assert warning.startswith("a worker of the cluster gets no work: 'changed' (tcp://127.0.0.1:")
             assert warning.endswith(f"has fcslam 0.1.0, {DIFFERENT}")
             assert len(workers.executors()) == 1
-            assert written(VerificationPool(workers.executors)(pairs, CONFIG)) == expected
+            assert written(VerificationPool(workers.executors)(pairs)) == expected
         assert len(warnings_of()) == 1
 
 
@@ -162,7 +160,7 @@ def test_a_cluster_that_is_not_there_is_told_in_one_line_or_waited_for(monkeypat
     ):
         pass
     with verifying("tcp://127.0.0.1:9", must_connect=False) as verify:
-        assert written(verify(pairs[:5], CONFIG)) == written(verify_here(pairs[:5], CONFIG))
+        assert written(verify(pairs[:5])) == written(verify_here(pairs[:5]))
         assert len(warnings_of()) == 1
 
 
@@ -196,7 +194,7 @@ def test_a_cluster_with_tls_takes_its_own_certificates_only(tmp_path, pairs, exp
         time.sleep(1.0)
         with configured(ours), DaskCluster(cluster.address) as workers:
             assert len(workers.executors()) == 1
-            assert written(VerificationPool(workers.executors)(pairs, CONFIG)) == expected
+            assert written(VerificationPool(workers.executors)(pairs)) == expected
 
 
 def is_silent(port):

@@ -45,11 +45,12 @@ def exhaustive(scan, pyramid, guess, window):
 
 def penalised(result, guess, window, scan):
     """The score of a result with the penalty of where it lies."""
+    pose, score = result
     step, turns, shifts = steps(scan, window, CELL_M)
-    move = np.round((result.T_field_base[:2] - guess[:2]) / CELL_M)
-    turn = np.round(se2.wrap_angle(result.T_field_base[2] - guess[2]) / step)
+    move = np.round((pose[:2] - guess[:2]) / CELL_M)
+    turn = np.round(se2.wrap_angle(pose[2] - guess[2]) / step)
     away = window.distance_penalty * min(1, float(move @ move) / max(1, shifts**2))
-    return result.score * (1 - away) * (1 - window.angle_penalty * (turn / max(1, turns)) ** 2)
+    return score * (1 - away) * (1 - window.angle_penalty * (turn / max(1, turns)) ** 2)
 
 
 @pytest.mark.slow
@@ -81,8 +82,8 @@ def test_a_far_offset_is_recovered_in_a_wide_window(offset):
     field = field_of([(scan_at(pose, walls, noise_m=0.015, rng=rng), pose) for pose in poses])
     truth = np.array([0.4, 0.2, 0.1])
     scan = scan_at(truth, walls, noise_m=0.015, rng=rng)
-    found = search(scan, field, truth + np.array(offset), SearchWindow(8.5, 0.75))
-    rest = se2.between(truth, found.T_field_base)
+    found, _ = search(scan, field, truth + np.array(offset), SearchWindow(8.5, 0.75))
+    rest = se2.between(truth, found)
     assert np.hypot(rest[0], rest[1]) < 0.15
     assert abs(rest[2]) < np.deg2rad(2)
 
@@ -97,6 +98,6 @@ def test_nothing_to_see_answers_with_the_guess():
         (scan_at((0, 0, 0), room()), field_of([]), guess),
         (nothing, field, far),
     ):
-        found = search(scan, where, there, SearchWindow(1.0, 0.3))
-        np.testing.assert_array_equal(found.T_field_base, there)
-        assert found.score == 0.0
+        found, score = search(scan, where, there, SearchWindow(1.0, 0.3))
+        np.testing.assert_array_equal(found, there)
+        assert score == 0.0

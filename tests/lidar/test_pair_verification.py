@@ -16,7 +16,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import AHEAD, Pair, VerificationPool, verify_here
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.verification import Gate, VerificationConfig
+from fcslam.lidar.verification import Gate
 from tests import small_fleet
 from tests.small_fleet import fingerprint, in_order
 
@@ -78,15 +78,15 @@ def written(checks):
 def test_a_pool_finds_what_is_found_here(pairs, workers, pool):
     """The limits are such that the noise of the submaps, which its processes do not know, decides some pairs."""
     asked = []
-    noisy = [pair._replace(noise=lambda: asked.append(1) or 0.5) for pair in pairs]
-    config = VerificationConfig(strict=Gate(explained=0.2, violation=0.02, count=10, overlap=0.25))
-    expected = written(verify_here(noisy, config))
+    loose = Gate(explained=0.2, violation=0.02, count=10, overlap=0.25)
+    noisy = [pair._replace(noise=lambda: asked.append(1) or 0.5, predicted=True, loose=loose) for pair in pairs]
+    expected = written(verify_here(noisy))
     assert 0 < len(asked) < len(pairs)
     verify = pool(workers)
     for _ in range(2):
-        found = verify(noisy, config)
+        found = verify(noisy)
         assert written(found) == expected
-    assert len({check.strict for check in found}) == 2, "pairs of both kinds"
+    assert len({check.loose for check in found}) == 2, "pairs of both kinds"
 
 
 def test_a_submap_is_sent_once_however_often_it_is_built(pairs):
@@ -102,7 +102,7 @@ def test_a_submap_is_sent_once_however_often_it_is_built(pairs):
     verify = VerificationPool(lambda: [executor], batch=2)
     for _ in range(3):
         rebuilt = [pair._replace(a=pickle.loads(pickle.dumps(pair.a))) for pair in pairs]
-        verify(rebuilt, VerificationConfig())
+        verify(rebuilt)
     assert 0 < len(sent) == len(set(sent))
 
 
@@ -128,12 +128,12 @@ forgets = ending(lambda future, batch: future.set_result(list(batch)))
 
 @pytest.mark.parametrize("fails", [gone, dies, is_cancelled, stays_away, forgets])
 def test_what_a_process_does_not_do_is_done_by_others(pairs, fails, caplog):
-    failing, config = Failing(fails), VerificationConfig()
-    expected = written(verify_here(pairs, config))
+    failing = Failing(fails)
+    expected = written(verify_here(pairs))
     with ThreadPoolExecutor(1) as works:
         verify = VerificationPool(lambda: [failing, works], batch=2, patience_s=0.05)
         for _ in range(3):
-            assert written(verify(pairs, config)) == expected
+            assert written(verify(pairs)) == expected
     assert failing.asked
     if fails is not forgets:
         assert failing.asked <= AHEAD + 1, "it rests, or still has what it was given"
@@ -143,9 +143,9 @@ def test_what_a_process_does_not_do_is_done_by_others(pairs, fails, caplog):
 def test_an_error_of_the_pairs_is_that_of_this_process(pairs, pool):
     broken = [pair._replace(T_a_b_guess=np.zeros(1)) for pair in pairs]
     with pytest.raises((IndexError, ValueError, TypeError)) as here:
-        verify_here(broken, VerificationConfig())
+        verify_here(broken)
     with pytest.raises(here.type):
-        pool(2)(broken, VerificationConfig())
+        pool(2)(broken)
 
 
 def test_a_fleet_with_a_pool_is_the_same(packets, pool):
@@ -160,12 +160,11 @@ def test_a_fleet_with_a_pool_is_the_same(packets, pool):
 
 def test_processes_find_what_is_found_here(pairs):
     """One of them is killed."""
-    config = VerificationConfig()
     with ProcessPoolExecutor(1, get_context("spawn")) as one, ProcessPoolExecutor(1, get_context("spawn")) as two:
         found = VerificationPool(lambda: [one, two], batch=2)
         killed = one.submit(os.getpid).result()
         two.submit(os.getpid).result()
         for batch in (pairs, pairs[::-1], pairs[3:9], pairs):
-            assert written(found(batch, config)) == written(verify_here(batch, config))
+            assert written(found(batch)) == written(verify_here(batch))
             if len(batch) < len(pairs):
                 os.kill(killed, signal.SIGKILL)

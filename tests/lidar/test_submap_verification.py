@@ -18,15 +18,12 @@ from fcslam.lidar.verification import (
     CLOSURE_SIGMA_M,
     CLOSURE_SIGMA_RAD,
     Aligned,
-    VerificationConfig,
     _information_of_inverse,
     judge,
     verify,
 )
 from fcslam.records import ReasonCode
 from tests.lidar.worlds import bare_scan, box, corridor, other_room, ring, room, scan_at
-
-CONFIG = VerificationConfig()
 
 
 def submap_along(waypoints, walls, seed):
@@ -51,7 +48,7 @@ def test_the_same_room_from_two_drives_is_verified(same_room):
     (a, anchor_a), (b, anchor_b) = same_room
     truth = se2.between(anchor_a, anchor_b)
     for offset in ((0.0, 0.0, 0.0), (0.25, -0.2, 0.08), (-0.2, 0.2, -0.08)):
-        found = verify(a, b, se2.compose(truth, offset), CONFIG)
+        found = verify(a, b, se2.compose(truth, offset))
         assert found.strict
         assert found.loose
         assert found.informative
@@ -64,7 +61,7 @@ def test_the_same_room_from_two_drives_is_verified(same_room):
 def test_both_orders_give_inverse_poses(same_room):
     (a, anchor_a), (b, anchor_b) = same_room
     guess = se2.compose(se2.between(anchor_a, anchor_b), (0.15, -0.1, 0.05))
-    there, back = verify(a, b, guess, CONFIG), verify(b, a, se2.inverse(guess), CONFIG)
+    there, back = verify(a, b, guess), verify(b, a, se2.inverse(guess))
     rest = se2.compose(there.T_a_b, back.T_a_b)
     assert np.hypot(rest[0], rest[1]) < 0.01
     assert abs(rest[2]) < np.deg2rad(0.1)
@@ -73,7 +70,7 @@ def test_both_orders_give_inverse_poses(same_room):
 
 def test_the_information_is_symmetric_positive_and_no_better_than_the_floor(same_room):
     (a, anchor_a), (b, anchor_b) = same_room
-    information = verify(a, b, se2.between(anchor_a, anchor_b), CONFIG).information
+    information = verify(a, b, se2.between(anchor_a, anchor_b)).information
     np.testing.assert_array_equal(information, information.T)
     sigma = np.sqrt(np.diag(np.linalg.inv(information)))
     assert np.all(sigma >= np.array([CLOSURE_SIGMA_M, CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD]) - 1e-12)
@@ -84,7 +81,7 @@ def test_the_information_is_symmetric_positive_and_no_better_than_the_floor(same
 def test_two_different_rooms_are_not_the_same_place(guess):
     a, _ = submap_along(WEST, room(), 0)
     b, _ = submap_along(EAST, other_room(), 1)
-    found = verify(a, b, np.array(guess), CONFIG)
+    found = verify(a, b, np.array(guess))
     assert not found.loose
     assert not found.strict
     assert found.reason.code is not ReasonCode.VERIFIED
@@ -95,7 +92,7 @@ def test_what_has_little_or_nothing_in_common_is_not_the_same_place(same_room):
     a, anchor_a = submap_along([(1.5 + 0.2 * k, 1.5, 0.0) for k in range(5)], ring(), 0)
     b, anchor_b = submap_along([(14.5, 10.5 - 0.2 * k, 3.0) for k in range(5)], ring(), 1)
     for one, other, guess in ((same_room[0][0], empty, np.zeros(3)), (a, b, se2.between(anchor_a, anchor_b))):
-        found = verify(one, other, guess, CONFIG)
+        found = verify(one, other, guess)
         assert not found.loose
         assert np.isfinite(found.information).all()
 
@@ -103,7 +100,7 @@ def test_what_has_little_or_nothing_in_common_is_not_the_same_place(same_room):
 def test_a_room_against_itself_turned_around_is_not_the_same_place(same_room):
     (a, anchor_a), (b, anchor_b) = same_room
     turned = se2.compose(se2.compose(se2.inverse(anchor_a), (0, 0, np.pi)), anchor_b)
-    assert not verify(a, b, turned, CONFIG).loose
+    assert not verify(a, b, turned).loose
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.0])
@@ -117,7 +114,7 @@ def test_a_bare_corridor_is_not_informative(heading):
         return submap_along([se2.compose(turned, pose) for pose in line], walls, seed)
 
     (a, anchor_a), (b, anchor_b) = along(0.0, 0.0, 0), along(2.0, 1.9, 1)
-    found = verify(a, b, se2.between(anchor_a, anchor_b), CONFIG)
+    found = verify(a, b, se2.between(anchor_a, anchor_b))
     assert not found.informative
     assert found.reason.code is not ReasonCode.VERIFIED
     values, vectors = np.linalg.eigh(found.information[:2, :2])
@@ -172,12 +169,12 @@ def test_noise_is_measured_for_the_gate_that_decides(violation, predicted):
     aligned = Aligned(np.zeros(3), np.eye(3), free, np.zeros(3))
     asked = []
     noise = lambda: asked.append(1) or 0.2  # noqa: E731
-    decided, other = (judge(aligned, CONFIG, noise, each) for each in (predicted, not predicted))
+    decided, other = (judge(aligned, noise, each) for each in (predicted, not predicted))
     assert len(asked) == 1
     assert (decided.strict, decided.loose) == (not predicted, True)
     assert (other.strict, other.loose) == (False, not predicted)
     much = aligned._replace(worse=replace(free, violation=0.11))
-    assert not judge(much, CONFIG, lambda: 1.0, False).strict, "no scanner is allowed much"
+    assert not judge(much, lambda: 1.0, False).strict, "no scanner is allowed much"
 
 
 def walking_along(waypoints, seed, stride_m=0.35):
@@ -202,7 +199,7 @@ def test_somebody_who_walks_by_leaves_no_trace(same_room):
     assert trail.mean() < 0.02
     assert len(walked.surface) > 0.9 * len(quiet.surface)
     other, anchor_other = same_room[1]
-    assert verify(walked, other, se2.between(anchor, anchor_other), CONFIG).strict
+    assert verify(walked, other, se2.between(anchor, anchor_other)).strict
 
 
 def test_somebody_who_stands_is_part_of_the_place():
@@ -218,7 +215,7 @@ def test_along_a_bare_corridor_only_a_prior_holds():
     (a, at_a), (b, at_b) = submap_along(along, corridor(), 4), submap_along(back, corridor(), 5)
     truth = se2.between(at_a, at_b)
     prior = np.diag((400.0, 400.0, 2000.0))
-    blind, seeing = verify(a, b, truth, CONFIG), verify(a, b, truth, CONFIG, prior)
+    blind, seeing = verify(a, b, truth), verify(a, b, truth, prior)
     assert not blind.informative
     assert not seeing.informative, "what repeats along a corridor repeats in images, too"
     off = se2.between(truth, seeing.T_a_b)
@@ -229,7 +226,7 @@ def test_where_walls_hold_a_false_prior_hardly_moves(same_room):
     (a, at_a), (b, at_b) = same_room
     truth = se2.between(at_a, at_b)
     shifted = truth + np.array([0.15, -0.1, 0.0])
-    found = verify(a, b, shifted, CONFIG, np.diag((400.0, 400.0, 2000.0)))
+    found = verify(a, b, shifted, np.diag((400.0, 400.0, 2000.0)))
     off = se2.between(truth, found.T_a_b)
     assert np.hypot(off[0], off[1]) < 0.05
 

@@ -7,7 +7,7 @@ from fcslam.features.birdseye import describe
 from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import verify_here
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.verification import NO_PRIOR, VERIFICATION
+from fcslam.lidar.verification import LOOSE, NO_PRIOR
 from fcslam.places import matcher as matcher_module
 from fcslam.places.matcher import MatcherConfig, PlaceMatcher
 from fcslam.places.motions import Motion
@@ -76,9 +76,9 @@ def test_of_many_doubtful_motions_only_the_best_are_verified(visits, monkeypatch
     wrong = [se2.compose(truth, (0.0, 0.0, angle)) for angle in np.linspace(0.5, 5.5, 10)]
     verified = []
 
-    def verify(pairs, config):
+    def verify(pairs):
         verified.append([np.asarray(pair.T_a_b_guess) for pair in pairs])
-        return verify_here(pairs, config)
+        return verify_here(pairs)
 
     matcher = PlaceMatcher(MatcherConfig(), visits.submap_of, np.random.default_rng(0), verify_pairs=verify)
     for place in stored:
@@ -126,9 +126,9 @@ def test_a_wrong_prediction_or_start_does_not_become_a_closure(visits):
 def test_a_known_start_needs_fewer_points(visits):
     asked = []
 
-    def verify(pairs, config):
-        asked.append(config.loose.count)
-        return verify_here(pairs, config)
+    def verify(pairs):
+        asked.extend(pair.loose.count for pair in pairs)
+        return verify_here(pairs)
 
     truth = se2.between(POSE_A, POSE_B)
     first, second = visits.visit("a", 0, room(), POSE_A), visits.visit("b", 0, room(), POSE_B)
@@ -137,7 +137,7 @@ def test_a_known_start_needs_fewer_points(visits):
     (match,) = matcher.match_at(second, {first.id: se2.compose(truth, (0.2, -0.2, 0.05))})
     assert np.all(np.abs(se2.between(truth, match.T_i_j)) < (0.03, 0.03, 0.01))
     assert not match.predicted
-    assert asked[-1] == round(VERIFICATION.loose.count / 3)
+    assert asked[-1] == round(LOOSE.count / 3)
 
 
 def test_a_robot_alone_is_never_compared(visits):

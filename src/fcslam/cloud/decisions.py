@@ -25,7 +25,7 @@ from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.evidence import ClusterEvidence
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import build_submap
-from fcslam.lidar.verification import VERIFICATION, verify
+from fcslam.lidar.verification import verify
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import (
     Change,
@@ -336,7 +336,7 @@ def measured(made: ManualClosure, i: Scans, j: Scans) -> tuple[FloatArray, Float
     guess, information = np.array(made.T_i_j), np.diag([1.0 / metres**2, 1.0 / metres**2, 1.0 / radians**2])
     if not all(any(len(scan.points) for scan, _ in scans) for scans in (i, j)):
         return guess, information
-    found = verify(build_submap(i), build_submap(j), guess, VERIFICATION, information)
+    found = verify(build_submap(i), build_submap(j), guess, information)
     off = np.abs(se2.between(guess, found.T_a_b))
     fits = found.loose and np.hypot(off[0], off[1]) <= AGREES_SIGMAS * metres and off[2] <= AGREES_SIGMAS * radians
     return (found.T_a_b, found.information) if fits else (guess, information)

@@ -16,9 +16,9 @@ from fcslam.lidar.frontend import SUBMAP_REACH_M, LidarConfig, MappedKeyscan
 from fcslam.lidar.submap import Submap, build_submap
 from fcslam.records import Constraint, ConstraintKind, FloatArray, frozen
 
-SOLVE_AFTER, SOLVE_AFTER_SHARE = 20, 0.08
-"""The graph is solved once this many closures wait, or this share of the number of keyscans if that is more. The time
-of a solve grows with the graph, so solves become rarer and the mean cost per scan stays constant."""
+SOLVE_AFTER_SHARE = 0.08
+"""The graph is solved once more closures wait than this share of the number of keyscans. The time of a solve grows with
+the graph, so solves become rarer and the mean cost per scan stays constant."""
 
 DENSE_M = 50.0
 """Travel from the beginning of a session along which submaps are twice as dense, metres: robots that have just met have
@@ -140,16 +140,15 @@ class LidarBackend:
         )
 
     def _optimize_if_needed(self, closures: list[LocalClosure]) -> None:
-        """Solve at once if a closure contradicts the estimate, otherwise after ``SOLVE_AFTER`` closures.
+        """Solve at once if a closure contradicts the estimate, otherwise after some closures.
 
         A recognised loop may contradict it by so much that the Cauchy loss hardly pulls; only GNC closes it.
         """
         self._unsolved += len(closures)
-        enough = max(SOLVE_AFTER, SOLVE_AFTER_SHARE * len(self._T_local_base))
         if any(c.beyond_search for c in closures):
             self.optimized()
             self._unsolved = 0
-        elif self._unsolved >= enough or any(c.is_surprising for c in closures):
+        elif self._unsolved > SOLVE_AFTER_SHARE * len(self._T_local_base) or any(c.is_surprising for c in closures):
             self._poses = optimize(self._graph, self._poses, loss=Loss.CAUCHY).poses
             self._unsolved = 0
 

@@ -19,7 +19,7 @@ from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
 from fcslam.lidar.correlative import SearchWindow, search
 from fcslam.lidar.submap import Submap, read_submap, submap_bytes
-from fcslam.lidar.verification import ALIGNMENT_SCALE_M, SYMMETRY_M, SYMMETRY_RAD, VERIFICATION, Verification, verify
+from fcslam.lidar.verification import ALIGNMENT_SCALE_M, SYMMETRY_M, SYMMETRY_RAD, Verification, verify
 from fcslam.records import FloatArray
 
 NARROW_M = 2.0 * ALIGNMENT_SCALE_M
@@ -65,8 +65,6 @@ SIMILAR_PLACES = 6 * MOST_CANDIDATES
 """Most similar earlier submaps among which the places to compare are chosen."""
 WIDEST_M, WIDEST_RAD = 15.0, 0.7
 """Largest half side and half angle of the search window, metres and radians."""
-LEAST_SCORE = 0.5
-"""Least mean likelihood of the points that a search must reach."""
 RECOGNIZED_DRIFT = 0.25
 """Largest drift of the position, metres per metre of path through the graph, at which place recognition closes a loop
 out of the search's reach."""
@@ -213,11 +211,8 @@ class LoopCloser:
             guess = recognized
         elif radius > NARROW_M:
             window = SearchWindow(radius, angle, DISTANCE_PENALTY, ANGLE_PENALTY)
-            result = search(b.surface, a.field, predicted, window)
-            if result.score < LEAST_SCORE:
-                return None
-            guess = result.T_field_base
-        check = verify(a, b, guess, VERIFICATION)
+            guess, _ = search(b.surface, a.field, predicted, window)
+        check = verify(a, b, guess)
         innovation = se2.between(predicted, check.T_a_b)
         off_m, off_rad = float(np.hypot(innovation[0], innovation[1])), abs(float(innovation[2]))
         if recognized is None:

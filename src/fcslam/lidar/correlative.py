@@ -45,15 +45,6 @@ class SearchWindow:
 
 
 @dataclass(frozen=True, slots=True)
-class SearchResult:
-    """Best pose of a search."""
-
-    T_field_base: FloatArray
-    score: float
-    """Mean likelihood of the points, in [0, 1], without the penalty."""
-
-
-@dataclass(frozen=True, slots=True)
 class LikelihoodPyramid:
     """Likelihood of a surface in each cell, 0..255, and its maxima over growing windows."""
 
@@ -93,11 +84,12 @@ def search(
     window: SearchWindow,
     visible_only: bool = False,
     better_than: FloatArray | None = None,
-) -> SearchResult:
+) -> tuple[FloatArray, float]:
     """Find the best pose of a scan in a window around the guess, to half a cell and half an angle step.
 
-    ``visible_only`` matches only surfaces that face the guess. The result is ``better_than``, a pose in the window, if
-    none exceeds its score, which prunes the search; it is the guess with score 0 if no pose puts a point on a surface.
+    Returns it with its score: the mean likelihood of the points, in [0, 1], without the penalty. ``visible_only``
+    matches only surfaces that face the guess. The result is ``better_than``, a pose in the window, if none exceeds its
+    score, which prunes the search; it is the guess with score 0 if no pose puts a point on a surface.
     """
     cell_m = window.cell_m
     thinned = scan.thinned(cell_m, MOST_POINTS)
@@ -115,7 +107,7 @@ def search_pyramid(
     T_field_guess: FloatArray,
     window: SearchWindow,
     better_than: FloatArray | None = None,
-) -> SearchResult:
+) -> tuple[FloatArray, float]:
     """As ``search``, on a pyramid that was built before; poses have shape (3,)."""
     reach = float(np.quantile(np.hypot(*scan.points.T), REACH_QUANTILE)) if len(scan) else 1.0
     step_rad = 2.0 * np.arcsin(min(0.5, 0.5 * pyramid.cell_m / max(reach, 1.0)))
@@ -123,7 +115,7 @@ def search_pyramid(
     shifts = math.ceil(window.radius_m / pyramid.cell_m)
     guess = np.array(T_field_guess, dtype=np.float64)  # a writable copy: code is compiled once
     start = np.full(3, np.nan) if better_than is None else np.array(better_than)
-    pose, score = _branch_and_bound(
+    found: tuple[FloatArray, float] = _branch_and_bound(
         scan.points,
         pyramid.levels,
         pyramid.corner,
@@ -136,7 +128,7 @@ def search_pyramid(
         window.distance_penalty,
         window.angle_penalty,
     )
-    return SearchResult(pose, score)
+    return found
 
 
 @njit

@@ -60,16 +60,16 @@ class KartoTracker(ScanTracker):
             return TrackingResult(by_odometry, predicted)
         # 3. Scan matching. Without any response, odometry alone gives the pose.
         near, field = points.only(np.hypot(*(points.points - points.origin).T) < RANGE_M), self._fields[0][0]
-        found = search(near, field, T_local_guess, WINDOW, visible_only=True)
-        if found.score == 0.0:
+        T_field_base, score = search(near, field, T_local_guess, WINDOW, visible_only=True)
+        if score == 0.0:
             return TrackingResult(by_odometry, predicted)
-        information = np.linalg.inv(match_covariance(near, field, found.T_field_base))
-        tracked = TrackedScan(found.T_field_base, np.asarray(information), points, scan.sweep)
+        information = np.linalg.inv(match_covariance(near, field, T_field_base))
+        tracked = TrackedScan(T_field_base, np.asarray(information), points, scan.sweep)
         error = odometry_error(predicted.moved_m, predicted.turned_rad, self._odometry)
-        trust = predicted.trust.learn(se2.motion(T_local_guess, found.T_field_base), error)
-        accepted = predicted._replace(T_local_base=found.T_field_base, moved_m=0.0, turned_rad=0.0, trust=trust)
+        trust = predicted.trust.learn(se2.motion(T_local_guess, T_field_base), error)
+        accepted = predicted._replace(T_local_base=T_field_base, moved_m=0.0, turned_rad=0.0, trust=trust)
         # The grid knows surfaces, but no free space: what is off them lies in unknown area.
-        return TrackingResult(tracked, accepted, found.score, found.score)
+        return TrackingResult(tracked, accepted, score, score)
 
     def insert(self, points: PointScan, T_local_base: FloatArray, laser_count: int = 1) -> None:
         """Add a keyscan to the running buffer (see ``ScanTracker``)."""

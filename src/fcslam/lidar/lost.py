@@ -30,7 +30,7 @@ from fcslam.lidar.odometry import FIRST_MATCHES, OdometryModel, OdometryTrust, o
 from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import Agreement
 from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, SUPPORTED, TrackingResult
-from fcslam.lidar.verification import VERIFICATION, verify
+from fcslam.lidar.verification import LOOSE, verify
 from fcslam.records import FloatArray, LaserScan
 
 DOUBTFUL_TRAVEL_M = 1.0
@@ -51,7 +51,7 @@ LOST_VIOLATION = 0.30
 RODE = 0.73
 """A robot that leaves a closed cabin on another floor sees a smaller share on a surface, less the share in free space.
 The cabin says where its door is, so a part of the walls decides; but more of them lie in known area."""
-LEAST_OVERLAP = VERIFICATION.loose.overlap
+LEAST_OVERLAP = LOOSE.overlap
 """Least share of all points in known area; below it, nothing is decided."""
 STAYED_M, LARGEST_SPEED, REACHABLE_S = 1.0, 2.0, 5.0
 """Without odometry, a robot is looked for within so many metres, and so many more for each second of a gap in the
@@ -151,8 +151,9 @@ def relocated(scans: Sequence[LaserScan], frontend: LidarFrontend) -> FloatArray
     if ratio >= LEAST_RATIO and best.violation <= LARGEST_VIOLATION:
         return se2.compose(se2.compose(T_local_before, best.T_a_b), se2.inverse(T_first_now))
     T_local_first = frontend.localize(scans[0]).tracked.T_local_base
-    worse, gate = _agreement_at(T_local_first, frontend, fresh), VERIFICATION.loose
-    agrees = worse.explained >= gate.explained and worse.violation <= gate.violation and worse.overlap >= gate.overlap
+    worse = _agreement_at(T_local_first, frontend, fresh)
+    agrees = worse.explained >= LOOSE.explained and worse.violation <= LOOSE.violation
+    agrees &= worse.overlap >= LOOSE.overlap
     return T_local_first if agrees else None
 
 
@@ -165,7 +166,7 @@ def _agreement_at(
     """
     (before, T_local_before), (now, T_first_now) = frontend.recent_submap(until_s), fresh.recent_submap()
     predicted = se2.between(T_local_before, se2.compose(T_local_first, T_first_now))
-    return verify(before, now, predicted, VERIFICATION).worse
+    return verify(before, now, predicted).worse
 
 
 def is_in_reach(T_local_base: FloatArray, scan: LaserScan, frontend: LidarFrontend, gap_s: float) -> bool:

@@ -14,15 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fcslam.lidar.submap import Agreement, Submap, read_submap, submap_bytes
-from fcslam.lidar.verification import (
-    NO_PRIOR,
-    Aligned,
-    Verification,
-    VerificationConfig,
-    align,
-    judge,
-    no_noise,
-)
+from fcslam.lidar.verification import LOOSE, NO_PRIOR, Aligned, Gate, Verification, align, judge, no_noise
 from fcslam.records import FloatArray
 
 BATCH: Final = 20
@@ -51,24 +43,25 @@ class Pair(NamedTuple):
     noise: Callable[[], float] = no_noise
     """As in ``judge``. Stays in this process: it needs the scans."""
     predicted: bool = False
+    loose: Gate = LOOSE
     """As in ``judge``."""
 
 
-VerifyPairs = Callable[[Sequence[Pair], VerificationConfig], list[Verification]]
+VerifyPairs = Callable[[Sequence[Pair]], list[Verification]]
 """Verifies pairs and returns the results in their order."""
 
 
-def verify_here(pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
+def verify_here(pairs: Sequence[Pair]) -> list[Verification]:
     """Verify the pairs one after another in this process."""
-    return _judged(_aligned_here(pairs), pairs, config)
+    return _judged(_aligned_here(pairs), pairs)
 
 
 def _aligned_here(pairs: Sequence[Pair]) -> list[Aligned]:
     return [align(pair.a, pair.b, pair.T_a_b_guess, pair.prior) for pair in pairs]
 
 
-def _judged(aligned: Sequence[Aligned], pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
-    return [judge(found, config, pair.noise, pair.predicted) for found, pair in zip(aligned, pairs, strict=True)]
+def _judged(aligned: Sequence[Aligned], pairs: Sequence[Pair]) -> list[Verification]:
+    return [judge(found, pair.noise, pair.predicted, pair.loose) for found, pair in zip(aligned, pairs, strict=True)]
 
 
 @dataclass(slots=True)
@@ -109,7 +102,7 @@ class VerificationPool:
         self._hashes: dict[int, tuple[bytes, Submap]] = {}
         """By identity; the reference keeps the identity from being used again."""
 
-    def __call__(self, pairs: Sequence[Pair], config: VerificationConfig) -> list[Verification]:
+    def __call__(self, pairs: Sequence[Pair]) -> list[Verification]:
         """Results in the order of the pairs, whichever process is done first."""
         self._peers = {executor: self._peers.get(executor) or _Peer(executor) for executor in self._processes()}
         starts = range(0, len(pairs), self._batch)
@@ -141,7 +134,7 @@ class VerificationPool:
                         todo.append(start)
                     else:
                         done[start] = found
-        return _judged([found for start in starts for found in done[start]], pairs, config)
+        return _judged([found for start in starts for found in done[start]], pairs)
 
     def _has_room(self, peer: _Peer) -> bool:
         peer.pending = [future for future in peer.pending if not future.done()]

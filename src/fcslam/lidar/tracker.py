@@ -251,10 +251,10 @@ class ScanTracker:
         is_doubtful = match.explained < DOUBTFUL * match.known or contradicts
         if not is_doubtful and not is_long_step:
             return match, innovation
-        found = search(points, field, T_local_guess, SEARCH_WINDOW, visible_only=True, better_than=match.T_field_base)
-        if np.array_equal(found.T_field_base, match.T_field_base):
+        best, _ = search(points, field, T_local_guess, SEARCH_WINDOW, visible_only=True, better_than=match.T_field_base)
+        if np.array_equal(best, match.T_field_base):
             return match, innovation
-        other = match_scan(thinned, field, found.T_field_base, NO_INFORMATION, velocity)
+        other = match_scan(thinned, field, best, NO_INFORMATION, velocity)
         other_innovation = se2.motion(T_local_guess, other.T_field_base)
         gain = other.log_likelihood + learned.log_likelihood(other_innovation)
         gain -= match.log_likelihood + learned.log_likelihood(innovation)

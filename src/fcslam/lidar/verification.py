@@ -47,17 +47,10 @@ class Gate:
     """Least share of all points that lie in known area."""
 
 
-@dataclass(frozen=True, slots=True)
-class VerificationConfig:
-    """Verification of closures between submaps, aligned in both directions."""
-
-    strict: Gate = Gate(explained=0.80, violation=0.05, count=250, overlap=0.25)
-    """Where no estimate predicts the closure."""
-    loose: Gate = Gate(explained=0.70, violation=0.10, count=250, overlap=0.25)
-    """Where an estimate predicts it."""
-
-
-VERIFICATION = VerificationConfig()
+STRICT = Gate(explained=0.80, violation=0.05, count=250, overlap=0.25)
+"""Gate of a closure that no estimate predicts."""
+LOOSE = Gate(explained=0.70, violation=0.10, count=250, overlap=0.25)
+"""Gate of a closure that an estimate predicts."""
 PARTIAL = Gate(explained=0.65, violation=0.22, count=500, overlap=0.5)
 """Gate of a partially supported closure: much overlap, but bent submaps (outdoors, on a slope). It counts half in a
 cluster, and never alone."""
@@ -105,24 +98,17 @@ def no_noise() -> float:
     return 0.0
 
 
-def verify(
-    a: Submap,
-    b: Submap,
-    T_a_b_guess: FloatArray,
-    config: VerificationConfig,
-    prior: FloatArray = NO_PRIOR,
-) -> Verification:
+def verify(a: Submap, b: Submap, T_a_b_guess: FloatArray, prior: FloatArray = NO_PRIOR) -> Verification:
     """Check whether two submaps show the same place: align them in both directions and rate the worse one.
 
     Args:
         a, b: submaps, each in the coordinate frame of its anchor.
         T_a_b_guess: where the Gauss-Newton alignment starts, shape (3,), metres and radians.
-        config: thresholds.
         prior: information of the guess from matched keypoints, over (x, y, theta) in the coordinates of a, shape
             (3, 3). It fixes the alignment where no wall does, as along a corridor. It does not make a closure
             informative: structure that repeats along a corridor repeats in images, too.
     """
-    return judge(align(a, b, T_a_b_guess, prior), config)
+    return judge(align(a, b, T_a_b_guess, prior))
 
 
 def align(a: Submap, b: Submap, T_a_b_guess: FloatArray, prior: FloatArray = NO_PRIOR) -> Aligned:
@@ -156,7 +142,7 @@ def align(a: Submap, b: Submap, T_a_b_guess: FloatArray, prior: FloatArray = NO_
 
 
 def judge(
-    aligned: Aligned, config: VerificationConfig, noise: Callable[[], float] = no_noise, predicted: bool = False
+    aligned: Aligned, noise: Callable[[], float] = no_noise, predicted: bool = False, loose: Gate = LOOSE
 ) -> Verification:
     """Which gates an alignment passes.
 
@@ -172,18 +158,18 @@ def judge(
         noise = no_noise  # it takes two submaps, and decides nothing
     informative = weakest >= INFORMATIVE
     one_direction = Reason(ReasonCode.ONE_DIRECTION, weakest, INFORMATIVE)
-    strict = _shortfall(worse, config.strict, no_noise if predicted else noise)
-    loose = _shortfall(worse, config.loose, noise if predicted else no_noise)
+    not_strict = _shortfall(worse, STRICT, no_noise if predicted else noise)
+    not_loose = _shortfall(worse, loose, noise if predicted else no_noise)
     return Verification(
         T_a_b=aligned.T_a_b,
         information=aligned.information,
         worse=worse,
-        strict=symmetric and not strict,
-        loose=symmetric and not loose,
+        strict=symmetric and not not_strict,
+        loose=symmetric and not not_loose,
         partial=symmetric and informative and not _shortfall(worse, PARTIAL, no_noise),
         informative=informative,
-        reason=asymmetric or strict or (_VERIFIED if informative else one_direction),
-        loose_reason=asymmetric or loose or _VERIFIED,
+        reason=asymmetric or not_strict or (_VERIFIED if informative else one_direction),
+        loose_reason=asymmetric or not_loose or _VERIFIED,
     )
 
 

@@ -18,7 +18,7 @@ from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
 from fcslam.lidar.submap import Submap, agreement
-from fcslam.lidar.verification import NO_PRIOR, VERIFICATION, Verification
+from fcslam.lidar.verification import LOOSE, NO_PRIOR, Verification
 from fcslam.places.index import PlaceIndex, QueryResult
 from fcslam.places.motions import DISTINCT_M, DISTINCT_RAD, Motion, propose_motions
 from fcslam.places.similarity import PAPER_SCALE
@@ -233,9 +233,8 @@ class PlaceMatcher:
         """
         kept = [(i, T_i_j) for i, T_i_j in expected.items() if i in self._places]
         pairs = [self._pair(i, place, Motion(T_i_j, NO_PRIOR, 0.0), predicted=True) for i, T_i_j in kept]
-        loose = VERIFICATION.loose
-        fewer = replace(loose, count=round(START_SHARE * loose.count))
-        checks = self._verify_pairs(pairs, replace(VERIFICATION, loose=fewer))
+        fewer = replace(LOOSE, count=round(START_SHARE * LOOSE.count))
+        checks = self._verify_pairs([pair._replace(loose=fewer) for pair in pairs])
         matches = [
             PlaceMatch.verified(i, place.id, place.channel, 0.0, check, predicted=True)
             for (i, _), check in zip(kept, checks, strict=True)
@@ -388,7 +387,7 @@ class PlaceMatcher:
         """Verify the guesses of the comparisons; the best one of each counts."""
         comparisons = self._plausible(comparisons, place)
         pairs = [self._pair(i, place, guess, predicted) for i, guesses, predicted in comparisons for guess in guesses]
-        checks = iter(self._verify_pairs(pairs, VERIFICATION))
+        checks = iter(self._verify_pairs(pairs))
         matches: list[PlaceMatch] = []
         for i, guesses, predicted in comparisons:
             found = [next(checks) for _ in guesses]
