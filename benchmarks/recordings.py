@@ -40,7 +40,7 @@ from tests.sources.bag_messages import Said, odom, quaternion, save, tf
 from tests.sources.test_drivers import START, Scanner, pose_at
 
 RIGHT_M = 0.02
-SAID = "contradict", "not corrected", "have no times", "was lost", "while the odometry stands still"
+SAID = "contradict", "not corrected", "have no times", "was lost", "while the odometry stands still", "which then span"
 """Parts of the lines that say what is wrong."""
 COLUMNS = {"kind": "", "recording": "", "error, m": ".4f", "outcome": "", "said": ""}
 COUNTS = {"kind": "", "recordings": "", "right": "", "said": "", "refused": "", "wrong": ""}
@@ -231,6 +231,7 @@ ODOMETRY = {
     "inverse pose": lambda t, x, y, a: tuple(se2.inverse(np.array((x, y, a)))),
     "half the distance": lambda t, x, y, a: (0.5 * x, 0.5 * y, a),
     "centimetres": lambda t, x, y, a: (100.0 * x, 100.0 * y, a),
+    "millimetres": lambda t, x, y, a: (1000.0 * x, 1000.0 * y, a),
     "of another robot": lambda t, x, y, a: (0.3 * t, 0.0, 0.4 * math.sin(t)),
     "two publishers that begin elsewhere": lambda t, x, y, a: (x + 5.0 * (round(t / 0.08) % 2), y, a),
     "reset after 4 s": lambda t, x, y, a: tuple(se2.between(pose_at(4.0 * (t > 4.0)), np.array((x, y, a)))),

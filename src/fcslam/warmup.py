@@ -18,7 +18,6 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
 from fcslam.compiled import is_compiled, uncached
-from fcslam.geometry import se2
 from fcslam.lidar import correlative, matching
 from fcslam.lidar import field as field_code
 from fcslam.lidar.correlative import SearchWindow, search
@@ -33,18 +32,13 @@ from fcslam.places.matcher import MatcherConfig
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.processes import Background, start_copy
 from fcslam.records import (
-    CODE_BYTES,
-    PLACE_CHANNELS,
     Channel,
     CloudScan,
-    Constraint,
-    ConstraintKind,
     FloatArray,
     Keyscan,
     KeyscanId,
     LaserModel,
     LaserScan,
-    Place,
     Ranges,
     Sweep,
     frozen,
@@ -52,7 +46,7 @@ from fcslam.records import (
 from fcslam.robot.backend import OwnPlaces
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources.logs.carmen import numbers_in
-from fcslam.wire.messages import Body, Hello, Packet
+from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode, measure
 from fcslam.wire.quantisation import dequantise, rounded
 
@@ -80,10 +74,8 @@ def warm_up_scans() -> None:
 
 def warm_up_robot() -> None:
     """Compile submaps and their description, loop closing, packets of places, the vocabulary, and its comparisons."""
-    robot = RobotFrontend("r", RobotConfig(channels=(Channel.LIDAR,)))
-    for scan in made_up_scans(2 * _ROUND):
-        for packet in robot.process(scan):
-            measure(packet)
+    for packet in _driven("r", 2 * _ROUND):
+        measure(packet)
     places = OwnPlaces(VocabularyConfig(train_batch=2, leaf_capacity=32))
     surface = build_submap([(point_scan(s.ranges_m, s.laser), s.T_odom_base) for s in made_up_scans(9)]).surface.points
     for k in range(4):
@@ -130,8 +122,8 @@ def warm_up_fleet() -> None:
     vocabulary = VocabularyConfig(train_batch=2, leaf_capacity=32)
     cloud = Cloud(FleetConfig(matcher=MatcherConfig(small_fleet=0, vocabulary=vocabulary)), seed=0)
     for robot in ("a", "b"):
-        for number, body in enumerate(_bodies(robot)):
-            cloud.receive(encode(Packet(robot, 0, number, float(_STEPS), body)))
+        for packet in _driven(robot, _STEPS):
+            cloud.receive(encode(packet))
     result = cloud.finalize()
     tracks = {robot.robot: keyscan_track(robot) for robot in result.robots}
     run_of(result, tracks, (), "", OccupancyConfig(), with_local_maps=False, with_certificates=False)
@@ -171,28 +163,12 @@ def _compile(runs: Sequence[Callable[[], None]]) -> None:
         run()
 
 
-def _bodies(robot: str) -> Iterator[Body]:
-    """A robot that crosses the room, with places of both channels; other robots see the same."""
-    rng = np.random.default_rng(0)
-    codes = rng.integers(0, 256, (120, CODE_BYTES), dtype=np.uint8)
-    landmarks = rng.uniform((0.0, 0.0, 0.0), (16.0, 9.0, 2.0), (len(codes), 3))
-    poses = np.column_stack((2.0 + 0.4 * np.arange(_STEPS), np.full(_STEPS, 4.0), np.zeros(_STEPS)))
-    yield Hello(robot, 0, (_LASER,), dict.fromkeys(PLACE_CHANNELS, "made-up-1"))
-    for k, pose in enumerate(poses):
-        yield Keyscan(KeyscanId(robot, k), float(k), _ranges(pose))
-        if k:
-            yield _constraint(robot, poses, k - 1, k, ConstraintKind.ODOMETRY)
-        if k >= 6 and k % 3 == 0:
-            seen = np.hypot(*(landmarks[:, :2] - poses[k - 3, :2]).T) < 8.0
-            x, y = se2.transform(se2.inverse(poses[k - 3]), landmarks[seen, :2]).T
-            for channel, keypoints in ((Channel.LIDAR, (x, y)), (Channel.CAMERA, (x, y, landmarks[seen, 2]))):
-                described = frozen(np.column_stack(keypoints), np.float32), frozen(codes[seen], np.uint8)
-                yield Place(KeyscanId(robot, k - 3), channel, "made-up-1", k - 6, k, *described)
-    yield _constraint(robot, poses, 0, _STEPS // 2, ConstraintKind.CLOSURE)
-
-
-def _constraint(robot: str, poses: FloatArray, i: int, j: int, kind: ConstraintKind) -> Constraint:
-    return Constraint(robot, i, j, kind, frozen(se2.between(poses[i], poses[j])), frozen(np.diag((1e4, 1e4, 1e5))))
+def _driven(name: str, scans: int) -> Iterator[Packet]:
+    """The packets of a robot that drives around in the room."""
+    robot = RobotFrontend(name, RobotConfig(channels=(Channel.LIDAR,)))
+    for scan in made_up_scans(scans):
+        yield from robot.process(scan)
+    yield from robot.finish()
 
 
 def made_up_scans(count: int, scale: float = 1.0, sweep: Sweep | None = None) -> Iterator[LaserScan]:
