@@ -6,6 +6,7 @@ import pytest
 
 from fcslam.graph.evidence import (
     LARGEST_CONTRADICTION,
+    LARGEST_SEEN_THROUGH,
     LEAST_LIKENESS,
     LEAST_RATIO,
     ClusterEvidence,
@@ -47,6 +48,9 @@ def test_each_lack_has_its_reason_numbers_and_setting():
         replace(SPOT, fit=fit(1.25)): Reason(ReasonCode.NOT_UNIQUE, 1.25, 2.0, "minimum_evidence"),
         replace(SPOT, fit=fit(1.0)): Reason(ReasonCode.LOOK_ALIKE, 1.0, LEAST_RATIO),
         replace(SPOT, fit=fit(contradiction=0.06)): Reason(ReasonCode.MAPS_CONTRADICT, 0.06, LARGEST_CONTRADICTION),
+        replace(SPOT, fit=replace(fit(), seen_through=0.01)): Reason(
+            ReasonCode.MAPS_CONTRADICT, 0.01, LARGEST_SEEN_THROUGH
+        ),
         replace(SPOT, fit=fit(likeness=0.4)): Reason(ReasonCode.WALLS_DIFFER, 0.4, LEAST_LIKENESS),
     }
     for evidence, reason in lacks.items():

@@ -80,7 +80,7 @@ class ClosureDecisions(Kept):
         self._sessions = sessions
         self._space = space
         self._graph = graph
-        self.comparison = MapComparison(sessions)
+        self.comparison = MapComparison(sessions, space)
         self._due: dict[frozenset[str], int] = {}
         """Number of closures between two sessions from which on they are decided again."""
         self.closures = ClosureLog()

@@ -1,14 +1,16 @@
 """Comparison of the maps of two sessions: exhaustive around the places that match, or where a joint map lays them."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
 from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD
 from fcslam.cloud.session_store import SessionStore
+from fcslam.cloud.space import Space
 from fcslam.geometry import se2
-from fcslam.geometry.groups import group_of
+from fcslam.geometry.groups import SE2, group_of
 from fcslam.graph.cluster import local_frames, relative_frame
 from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import LARGEST_CONTRADICTION, LEAD, MapFit, refutation
@@ -53,8 +55,8 @@ class MapComparison(Kept):
 
     KEPT: ClassVar = {"_compared": dict[frozenset[str], list[_Compared]]}
 
-    def __init__(self, sessions: SessionStore) -> None:
-        self._sessions = sessions
+    def __init__(self, sessions: SessionStore, space: Space) -> None:
+        self._sessions, self._space = sessions, space
         self._compared: dict[frozenset[str], list[_Compared]] = {}
         """The last comparisons of each pair of sessions, one for each transform: later, places may be forgotten."""
 
@@ -67,9 +69,9 @@ class MapComparison(Kept):
         the places. An earlier comparison at the same transform counts until the cluster or the paths have grown by a
         factor, if the maps agreed clearly until the paths have, and for good if keyscans were released since.
         """
-        a, b, members, pair = a.to_plane(), b.to_plane(), members.to_plane(), frozenset(sessions)
-        T_a_b, size = relative_frame(a, b, members), len(a) + len(b)
-        earlier = [each for each in self._compared.get(pair, ()) if self._is_at(each, a, b, T_a_b)]
+        in_plane, pair, size = (a.to_plane(), b.to_plane()), frozenset(sessions), len(a) + len(b)
+        T_a_b = relative_frame(*in_plane, members.to_plane())
+        earlier = [each for each in self._compared.get(pair, ()) if self._is_at(each, *in_plane, T_a_b)]
         is_clear = bool(earlier) and earlier[0].agrees and earlier[0].fit.ratio >= LEAD
         if is_clear and size < growth * growth * earlier[0].size:
             return earlier[0].fit
@@ -110,6 +112,8 @@ class MapComparison(Kept):
         # SciPy's transforms take as long to load as a hundred scans, and most missions compare no maps.
         from fcslam.lidar.uniqueness import align_map, alignments, parallel_headings
 
+        seen_through = partial(self._space.seen_through, sessions, a.poses, b.poses, local_frames(a, b, members))
+        a, b, members = a.to_plane(), b.to_plane(), members.to_plane()
         local_maps = self._local_maps(sessions, a.poses, b.poses)
         near_a, i, is_complete_a = local_maps.around(0, a.poses[members.i, :2].mean(axis=0))
         near_b, j, is_complete_b = local_maps.around(1, b.poses[members.j, :2].mean(axis=0))
@@ -121,6 +125,8 @@ class MapComparison(Kept):
         T_a_i, T_b_j = a.poses[i.number], b.poses[j.number]
         T_i_j = _between(T_a_i, T_a_b, T_b_j)
         fit = _fit(local_maps.agreement(local_frames(a, b, members)))
+        if refutation(fit) is None:
+            fit = replace(fit, seen_through=seen_through())
         if refutation(fit) is None:  # else no transform elsewhere matters
             whole_a, whole_b = local_maps.whole(0, near_a, i.number), local_maps.whole(1, near_b, j.number)
             best = align_map(whole_a, whole_b, T_i_j)
@@ -136,9 +142,11 @@ class MapComparison(Kept):
 
     def at(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> MapFit:
         """Compare the maps of two sessions at poses (N, P) of their keyscans in the frame of one map."""
-        in_plane = group_of(poses_a).to_plane
-        poses_a, poses_b = in_plane(poses_a), in_plane(poses_b)
-        return _fit(self._local_maps(sessions, poses_a, poses_b).agreement(np.zeros_like(poses_b)))
+        group = group_of(poses_a)
+        local_maps = self._local_maps(sessions, group.to_plane(poses_a), group.to_plane(poses_b))
+        fit = _fit(local_maps.agreement(np.zeros((len(poses_b), SE2.size))))
+        same = np.broadcast_to(group.identity, poses_b.shape)
+        return replace(fit, seen_through=self._space.seen_through(sessions, poses_a, poses_b, same))
 
     def _local_maps(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> LocalMaps:
         a, b = (SeenKeyscans(self._sessions.keyscans(name), self._sessions.lasers(name)) for name in sessions)

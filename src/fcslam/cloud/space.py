@@ -13,9 +13,9 @@ from fcslam.cloud.session_store import SessionStore
 from fcslam.errors import PacketError
 from fcslam.geometry import se3
 from fcslam.geometry.groups import SE2, SE3, Group
-from fcslam.lidar.voxel_matching import PreparedMap, align_maps, disagreement, prepared
+from fcslam.lidar.voxel_matching import PreparedMap, align_maps, disagreement, prepared, seen_through
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import ClosureStatus, Constraint, FloatArray, KeyscanId, Reason, ReasonCode, frozen
+from fcslam.records import ClosureStatus, Constraint, FloatArray, KeyscanId, Reason, ReasonCode, VoxelMap, frozen
 
 _FLOOR_M, _FLOOR_RAD = 0.05, 0.02
 """Standard deviations of height and inclination of a floor that two robots saw at one place."""
@@ -24,6 +24,8 @@ _STEP_M, _STEP_RAD = 0.005, 0.003
 _SLOPE: Final = 0.02
 _NEAR_M, _NEAR_RAD = 0.6, 0.15
 """Farthest that the alignment of two voxel maps may be from where walls in the plane put them."""
+_MOST_COMPARED, _SAME_PLACE_M = 16, 3.0
+"""About how many places of two robots are compared for a join, and how near their voxel maps are."""
 _KEPT: Final = 60
 """Voxel maps that are kept ready to compare, 3 MB each."""
 
@@ -74,10 +76,10 @@ class Space:
             return match
         T_i_j, information = self.measured(match.i, match.j, match.T_i_j, match.information)
         lifted = replace(match, T_i_j=frozen(T_i_j), information=frozen(information))
-        a, b = self._map_of(match.i), self._map_of(match.j)
-        if not match.M or a is None or b is None:
+        voxels_a, voxels_b = self._sessions.voxel_map(match.i), self._sessions.voxel_map(match.j)
+        if not match.M or voxels_a is None or voxels_b is None:
             return lifted
-        guess = se3.from_plane(match.T_i_j)
+        a, b, guess = self._ready(voxels_a), self._ready(voxels_b), se3.from_plane(match.T_i_j)
         T_a_b, information = align_maps(a, b, guess)
         off = se3.between(guess, T_a_b)
         reason = _too_far(off) or disagreement(a, b, T_a_b, match.predicted)
@@ -85,6 +87,41 @@ class Space:
             return replace(lifted, status=ClosureStatus.CANDIDATE, reason=reason)
         T_i_j, information = self._of_bases(match.i, match.j, T_a_b, information)
         return replace(lifted, T_i_j=frozen(T_i_j), information=frozen(information))
+
+    def seen_through(
+        self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray, T_a_b: FloatArray
+    ) -> float:
+        """The share of surfaces that the other of two robots saw through, less its standard error between places.
+
+        ``T_a_b`` (N, P) is between the frames of the poses of both at each of the N keyscans of b; NaN: not known.
+        0.0 if a robot has no voxel maps. Furniture tells floors apart whose walls are the same.
+        """
+        if self.group is SE2:
+            return 0.0
+        a, b = map(self._sessions.voxel_maps, sessions)
+        b = tuple(voxels for voxels in b if np.isfinite(T_a_b[voxels.id.number, 0]))
+        if not a or not b:
+            return 0.0
+        grounds_a = np.array([se3.compose(poses_a[voxels.id.number], voxels.T_base_ground) for voxels in a])
+        counts = []
+        for new in b[:: 1 + len(b) // _MOST_COMPARED]:
+            number = new.id.number
+            between = se3.between(
+                grounds_a, se3.compose(se3.compose(T_a_b[number], poses_b[number]), new.T_base_ground)
+            )
+            nearest = int(np.argmin(SE3.shift_m(between)))
+            T = between[nearest]
+            if SE3.shift_m(T) < _SAME_PLACE_M:
+                maps = self._ready(a[nearest]), self._ready(new)
+                aligned, _ = align_maps(*maps, T)
+                T = T if _too_far(se3.between(T, aligned)) else aligned
+                counts.append(np.add(seen_through(*maps[::-1], T), seen_through(*maps, se3.inverse(T))))
+        if len(counts) < 2:
+            return 0.0
+        known, through = np.array(counts).T
+        share = float(through.sum() / max(1, known.sum()))
+        spread = np.sqrt(((through - share * known) ** 2).sum() * len(counts) / (len(counts) - 1))
+        return max(0.0, share - float(spread / max(1, known.sum())))
 
     def _of_bases(
         self, i: KeyscanId, j: KeyscanId, T_a_b: FloatArray, information: FloatArray
@@ -100,14 +137,11 @@ class Space:
         voxels = self._sessions.voxel_map(keyscan)
         return se3.IDENTITY if voxels is None else voxels.T_base_ground
 
-    def _map_of(self, keyscan: KeyscanId) -> PreparedMap | None:
-        voxels = self._sessions.voxel_map(keyscan)
-        if voxels is None:
-            return None
-        found = self._prepared.pop(keyscan, None) or prepared(voxels)
+    def _ready(self, voxels: VoxelMap) -> PreparedMap:
+        found = self._prepared.pop(voxels.id, None) or prepared(voxels)
         while len(self._prepared) >= _KEPT:
             del self._prepared[next(iter(self._prepared))]
-        self._prepared[keyscan] = found
+        self._prepared[voxels.id] = found
         return found
 
 

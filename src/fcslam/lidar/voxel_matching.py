@@ -94,6 +94,13 @@ class PreparedMap:
         return free
 
     @cached_property
+    def deep_free(self) -> NDArray[np.bool_]:
+        """Those cells of ``free`` whose neighbours are free, too: rays that graze a thin thing pass beside it."""
+        from scipy.ndimage import binary_erosion
+
+        return np.asarray(binary_erosion(self.free, np.ones((3, 3, 3), np.bool_)), np.bool_)
+
+    @cached_property
     def near(self) -> Any:
         """Finds the nearest points."""
         from scipy.spatial import cKDTree
@@ -140,16 +147,24 @@ def space_agreement(query: PreparedMap, target: PreparedMap, T_target_query: Flo
     """Measure how well ``query``, whose points are counted, agrees with ``target``."""
     points = se3.transform(T_target_query, query.points)
     distance_m, _ = target.near.query(points, distance_upper_bound=_OFF_SURFACE_M)
-    shape, corner = _GRID
-    cells = np.floor((points - corner) / _FREE_M).astype(np.int64)
-    inside = ((cells >= 0) & (cells < shape)).all(axis=1)
-    is_free = np.zeros(len(points), bool)
-    is_free[inside] = target.free[tuple(cells[inside].T)]
+    is_free = _at(points, target.free)
     explained = distance_m <= _ON_SURFACE_M
     known = max(1, int(np.count_nonzero(explained | is_free)))
     count = int(np.count_nonzero(explained))
     violating = int(np.count_nonzero(is_free & (distance_m > _OFF_SURFACE_M)))
     return SpaceAgreement(count / known, violating / known, count)
+
+
+def seen_through(query: PreparedMap, target: PreparedMap, T_target_query: FloatArray) -> tuple[int, int]:
+    """The number of points of ``query`` in known space of ``target``, and of those deep in its free space.
+
+    Points that are deep in free space of the query itself do not count: they are of people.
+    """
+    points = se3.transform(T_target_query, query.points[~_at(query.points, query.deep_free)])
+    distance_m, _ = target.near.query(points, distance_upper_bound=_OFF_SURFACE_M)
+    known = (distance_m <= _ON_SURFACE_M) | _at(points, target.free)
+    through = (distance_m > _OFF_SURFACE_M) & _at(points, target.deep_free)
+    return int(np.count_nonzero(known)), int(np.count_nonzero(through))
 
 
 def disagreement(a: PreparedMap, b: PreparedMap, T_a_b: FloatArray, predicted: bool) -> Reason | None:
@@ -165,6 +180,16 @@ def disagreement(a: PreparedMap, b: PreparedMap, T_a_b: FloatArray, predicted: b
     if violation > largest:
         return Reason(ReasonCode.IN_FREE_SPACE, violation, largest)
     return None
+
+
+def _at(points: FloatArray, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The values of cells as ``_GRID`` at points (N, 3), shape (N,); False outside."""
+    shape, corner = _GRID
+    rows = np.floor((points - corner) / _FREE_M).astype(np.int64)
+    inside = ((rows >= 0) & (rows < shape)).all(axis=1)
+    found = np.zeros(len(points), np.bool_)
+    found[inside] = cells[tuple(rows[inside].T)]
+    return found
 
 
 @njit(allocates=False)
