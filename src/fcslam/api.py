@@ -167,7 +167,8 @@ def localize(
         finished = FinishedMap(map) if isinstance(map, OccupancyMap) else read_finished(Path(map), floor)
     if isinstance(recording, str | os.PathLike):
         options = replace(bag_options or BagOptions(), in_3d=True) if finished.ply else bag_options
-        recording = _checked(sources.whole_clouds(sources.open_source(Path(recording), options), options))
+        opened = sources.whole_clouds(sources.open_source(Path(recording), options), options)
+        recording = _checked(calibrated(opened, settings.robot.lidar))
     initial = None if initial_pose is None else pose_in_map("initial_pose", initial_pose, finished.occupancy)
     run = run_localization(recording, finished, settings, initial, progress or (lambda _: None), update)
     if output is not None:

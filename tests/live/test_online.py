@@ -319,6 +319,4 @@ def test_a_server_that_turns_the_robot_away_stops_no_scan(scans, tmp_path):
         with pytest.raises(CloudError, match="no token"):
             robot.finish()
         robot.close()
-    assert [(event.kind, event.text) for event in events] == [
-        (EventKind.FAILED, "nothing is sent or kept any more: no token")
-    ]
+    assert [(event.kind, event.text) for event in events] == [(EventKind.FAILED, "nothing is sent any more: no token")]

@@ -111,6 +111,14 @@ def test_a_folder_with_something_else_stays_as_it_is(floors, tmp_path):
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["letter.txt"]
 
 
+def test_a_run_of_its_own_stays_as_it_is(floors, tmp_path):
+    run_of([(building(40), "")]).save(tmp_path / "mine")
+    (tmp_path / "mine" / "mission.fcslam").write_bytes(b"packets")
+    with pytest.raises(InputError, match="mine: is a run"):
+        fetch_maps(tmp_path / "mine", Server(floors))
+    assert (tmp_path / "mine" / "mission.fcslam").read_bytes() == b"packets"
+
+
 def test_a_map_that_the_cloud_draws_anew_meanwhile_is_read_again(floors, tmp_path, monkeypatch):
     """The list of maps is older than the files once, then always."""
     answers = []

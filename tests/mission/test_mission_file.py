@@ -108,6 +108,7 @@ def test_a_robot_that_comes_back_begins_a_new_session(logs, begun, tmp_path):
 def test_vetoes_stay_in_force(logs, tmp_path):
     first, second = (path.stem for path in logs[:2])
     fcslam.map_recordings(logs[:2], output=tmp_path / "apart", vetoes=[Veto(first, second)])
+    assert [edit.time_s for edit in read_mission(tmp_path / "apart").edits] == [0.0]  # the same bytes whenever it runs
     run = fcslam.map_recordings([], onto=tmp_path / "apart")
     between = [c for c in run.closures if {c.robot_i, c.robot_j} == {first, second}]
     assert between

@@ -343,3 +343,20 @@ def test_a_cut_outbox_is_told(path):
         with pytest.raises(InputError, match=r"cannot be used: .*; give another --state") as told:
             Outbox(path, "alice", LIMIT)
         assert "\n" not in str(told.value)
+
+
+def test_a_new_start_forgets_what_the_cloud_has(outbox, path):
+    outbox.put([said(k) for k in range(5)])
+    outbox.synchronize({})
+    outbox.acknowledge(0, 2)
+    outbox.close()
+    again = Outbox(path, "alice", LIMIT)
+    again.begin("another", resume=False)
+    again.synchronize({0: 3})
+    assert list(drain(again)) == [(0, 3), (0, 4)]
+    again.close()
+    third = Outbox(path, "alice", LIMIT)
+    third.begin("a third", resume=False)
+    third.close()
+    with sqlite3.connect(path) as database:
+        assert database.execute("SELECT count(*) FROM packets").fetchall() == [(0,)]

@@ -127,3 +127,24 @@ def test_wrong_arguments_are_one_line(words, said, capsys, tmp_path, monkeypatch
     assert main(words) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
+
+
+def test_a_recording_ends_although_messages_keep_coming(tmp_path):
+    network, stop = MemoryNetwork(TOPICS), threading.Event()
+    topics = await_sensors(network, "", BagOptions(), 0.0, 0.0)
+    counts = []
+    thread = threading.Thread(
+        target=lambda: counts.append(record(network, topics, tmp_path / "day.mcap", stop, print)), daemon=True
+    )
+    thread.start()
+    while "/clock" not in network.subscribed:
+        stop.wait(0.01)
+    messages = messages_of(100_000, RANGES)
+    for number, (topic, kind, message) in enumerate(messages):
+        network.say(topic, kind, message)
+        if number == 50:
+            stop.set()
+        if not thread.is_alive():
+            break
+    thread.join(120.0)
+    assert 50 < sum(counts[0].values()) < 200_001

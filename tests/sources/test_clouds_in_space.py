@@ -1,6 +1,7 @@
 """Clouds that are read whole: from bags with wheels and an IMU, from files, and bad ones."""
 
 import re
+import time
 from pathlib import Path
 
 import numpy as np
@@ -193,3 +194,17 @@ def test_a_broken_file_is_left_out_and_times_must_be_there(tmp_path):
     (source,) = open_fleet([(Path(tmp_path), "anna")], IN_3D)
     with pytest.raises(SourceError, match="has 2 times for 4 clouds"):
         source.survey()
+
+
+def test_dates_are_those_of_utc_wherever_they_are_read(tmp_path, monkeypatch):
+    monkeypatch.setenv("TZ", "America/New_York")
+    time.tzset()
+    points = spinning(pose_at, LIDAR, columns=90).points
+    for number in range(3):
+        (tmp_path / f"{number}.ply").write_bytes(ply(points, "ascii"))
+    (tmp_path / "timestamps.txt").write_text("\n".join(f"2011-09-26 13:02:25.{k}94360375" for k in range(3)))
+    (source,) = open_fleet([(Path(tmp_path), "anna")], IN_3D)
+    stamps = [each.stamp for each in source.records()]
+    monkeypatch.undo()
+    time.tzset()
+    assert stamps == pytest.approx([1317042145.09436, 1317042145.19436, 1317042145.29436])

@@ -50,10 +50,10 @@ def list_edits(mission: Mission) -> None:
     edits = read_mission(mission).edits
     gone = undone(edits)
     for edit in edits:
-        when = datetime.fromtimestamp(edit.time_s, UTC)
+        when = f"{datetime.fromtimestamp(edit.time_s, UTC):%Y-%m-%d %H:%M:%S} UTC" if edit.time_s else "from the start"
         end = f"  undone by {gone[edit.number]}" if edit.number in gone else ""
         content = f"{kind_of(edit.content)} {edit_json(edit.content)}"
-        typer.echo(f"{edit.number}  {when:%Y-%m-%d %H:%M:%S} UTC  {edit.author}  {content}{end}")
+        typer.echo(f"{edit.number}  {when}  {edit.author}  {content}{end}")
     if not edits:
         typer.echo("no edits")
 

@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fcslam.cli.output import print_line
+from fcslam.cli.warm_up import compiled
 from fcslam.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from fcslam.lidar.frontend import LidarConfig
     from fcslam.ros.addresses import RosAddress
     from fcslam.ros.parameters import NodeParameters
     from fcslam.sources import BagOptions, Source, Survey
@@ -64,15 +66,27 @@ def bag_options(given: list[str] | None) -> "BagOptions | None":
 
 
 def open_recording(
-    argument: str, sensors: list[str] | None, console: "Console", in_3d: bool = False
+    argument: str,
+    sensors: list[str] | None,
+    console: "Console",
+    in_3d: bool = False,
+    lidar: "LidarConfig | None" = None,
 ) -> "tuple[Source, Survey]":
-    """Open the recording of an argument ``LOG`` or ``NAME=LOG``, and print what was chosen in it."""
+    """Open the recording of an argument ``LOG`` or ``NAME=LOG``, and print what was chosen in it.
+
+    With ``lidar``, a bag is calibrated, as before it is mapped.
+    """
     from fcslam.sources import BagOptions, open_source, planar_note, whole_clouds
 
     path, name = named_path(argument)
     options = bag_options(sensors)
     options = replace(options or BagOptions(), in_3d=True) if in_3d else options
     source = whole_clouds(open_source(path, options, name), options)
+    if lidar is not None:
+        from fcslam.robot.calibrating import calibrated
+
+        with compiled(console, in_3d):
+            source = calibrated(source, lidar)
     survey = source.survey()
     print_notes(console, [*survey.notes, *filter(None, [planar_note([source]) if in_3d else ""])])
     return source, survey

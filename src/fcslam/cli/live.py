@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import RobotEvent, RobotPose
     from fcslam.live.robot import Robot
+    from fcslam.ros.node import RobotNode
 
 SERVER_PATIENCE_S = 60.0
 """Longest wait for the server at the end of a drive."""
@@ -106,15 +107,11 @@ def drive_live(
 
                 process = LearningProcess(learning, robot.name, notify)
             with standstill_learning(process, robot) as follow:
-                node.run(pose_watch(notify, follow))
+                failure = _drive(node, pose_watch(notify, follow))
             if not node.scans:
                 notify("no scan was mapped; nothing is written")
                 return
-            failure = None
-            if isinstance(robot, LocalizedRobot):
-                robot.finish()
-            else:
-                failure = _finish(robot, notify)
+            failure = _finish(robot, notify) or failure
             node.publish_map()
             run = robot.save(output)
         print_faults(console, {robot.name: node.sensors.audit.faults()})
@@ -123,10 +120,25 @@ def drive_live(
         raise failure
 
 
-def _finish(robot: "Robot", notify: Callable[[str], None]) -> FcslamError | None:
-    """End the recording; returns why the server or the state folder cannot be used. The run is written all the same."""
+def _drive(node: "RobotNode", watch: Callable[[int, "RobotPose | None"], None]) -> FcslamError | None:
+    """Map until the node is stopped, or until an error, which it returns if there are scans to save."""
     try:
-        if not robot.finish(SERVER_PATIENCE_S):
+        node.run(watch)
+    except FcslamError as error:
+        if not node.scans:
+            raise
+        return error
+    return None
+
+
+def _finish(robot: "Robot | LocalizedRobot", notify: Callable[[str], None]) -> FcslamError | None:
+    """End the drive; returns why the server or the state folder cannot be used. The run is written all the same."""
+    from fcslam.live.localized_robot import LocalizedRobot
+
+    try:
+        if isinstance(robot, LocalizedRobot):
+            robot.finish()
+        elif not robot.finish(SERVER_PATIENCE_S):
             notify("the server does not have everything; the rest is sent at the next start with the same --state")
     except InputError as error:
         return error

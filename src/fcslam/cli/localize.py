@@ -113,7 +113,7 @@ def localize(
     prepare_output(output, force)
     with compiled(console):
         finished = read_finished(map_path, floor)
-        recording, survey = open_recording(source, sensors, console, in_3d=bool(finished.ply))
+        recording, survey = open_recording(source, sensors, console, bool(finished.ply), settings.robot.lidar)
         with ProgressDisplay(console) as display:
 
             def watch(now: "LocalizationProgress") -> None:

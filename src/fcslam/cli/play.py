@@ -83,7 +83,7 @@ def play(
         raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")
     pace = PlaybackPace(speed, time.monotonic, time.sleep)
     console = notices(quiet)
-    opened, survey = open_recording(recording, sensors, console, in_3d=settings.fleet.dimensions == 3)
+    opened, survey = open_recording(recording, sensors, console, settings.fleet.dimensions == 3, settings.robot.lidar)
     try:
         check_robot(opened.name)
     except PacketError as error:

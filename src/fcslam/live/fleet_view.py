@@ -25,8 +25,6 @@ POLL_S: Final = 0.5
 """Time between two looks at the fleet."""
 DOWNLINK_KB_PER_S: Final = 15.0
 """Limit of the tiles, kB per second, without a budget."""
-MOST_NEWS: Final = 1000
-"""Changes of the fleet that are kept."""
 
 
 class FleetView:
@@ -192,5 +190,4 @@ class FleetView:
                 parts.append(f"taken out: {', '.join(sorted(gone))}")
             everybody = ", ".join(sorted(others | {self._robot}))
             line = f"map {self.map_index} holds {everybody}" + "".join(f"; {part}" for part in parts)
-        if len(self.news) < MOST_NEWS:
-            self.news.append(line)
+        self.news.append(line)

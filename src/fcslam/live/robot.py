@@ -543,7 +543,8 @@ class Robot(LiveTracker):
         if self._uplink is None:
             return
         if self._uplink.failure is not None:
-            self._tell_failure(f"nothing is sent or kept any more: {self._uplink.failure}")
+            what = "sent" if self._uplink.failure is self._uplink.sender.failure else "sent or kept"
+            self._tell_failure(f"nothing is {what} any more: {self._uplink.failure}")
         sender, was_online = self._uplink.sender, self._is_online
         if sender.trouble is None and was_online is not True and sender.confirmed:
             self._is_online = True

@@ -10,7 +10,7 @@ from fcslam.errors import CloudError, InputError, SourceError, UnavailableError
 from fcslam.maps.occupancy_map import area_of, map_stem, parse_map
 from fcslam.records import FloatArray, frozen
 from fcslam.runs import RobotTrajectory, Run, prepare_output
-from fcslam.runs.folder import is_run_folder
+from fcslam.runs.folder import MISSION, is_run_folder
 from fcslam.wire.fleet_client import MapClient
 from fcslam.wire.fleet_replies import ServedMap
 from fcslam.wire.http_transport import Server, addresses
@@ -28,6 +28,8 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
     Returns:
         None; or why the cloud cannot be reached, if ``folder`` holds an earlier copy, which then stays as it is.
     """
+    if (folder / MISSION).exists():
+        raise InputError(f"{folder}: is a run, no copy of the maps of a cloud; give another folder")
     prepare_output(folder, force=True)
     troubles = []
     for address in addresses(server.url):

@@ -6,7 +6,6 @@ sources -> robot (LiDAR SLAM, features) -> packets -> cloud (places -> graph -> 
 import heapq
 import itertools
 import logging
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -145,7 +144,7 @@ class MissionCloud:
         self._packets: list[StoredPacket] = []
         self._refused = onto.refused
         numbers = itertools.count(len(onto.edits) + 1)
-        self.host.follow([*onto.edits, *(Edit(next(numbers), AUTHOR, time.time(), veto) for veto in inputs.vetoes)])
+        self.host.follow([*onto.edits, *(Edit(next(numbers), AUTHOR, 0.0, veto) for veto in inputs.vetoes)])
         for packet in onto.refused:
             self.host.refuse(packet.robot, packet.epoch, packet.sequence)
 

@@ -127,6 +127,7 @@ class Outbox:
                 self.first_epoch = int(last)
                 (self.epoch,) = _one(connection, "SELECT max(epoch) FROM sessions")
             else:
+                connection.execute("DELETE FROM packets WHERE data IS NULL")
                 self.first_epoch = self._open_session(connection, 0, recording)
             return int(_one(connection, "SELECT count(*) FROM packets WHERE epoch >= ?", self.first_epoch)[0])
 

@@ -89,6 +89,10 @@ class Inbox:
         else:
             self._messages.put(ReceivedMessage(topic, payload, now_ns()))
 
+    def __len__(self) -> int:
+        """Number of messages that wait."""
+        return self._messages.qsize()
+
     def get(self, timeout_s: float) -> ReceivedMessage | None:
         """The next message; None if none came within the time."""
         try:

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 from fcslam.errors import InputError
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC
-from fcslam.ros.inbox import POLL_S, Inbox
+from fcslam.ros.inbox import POLL_S, Inbox, ReceivedMessage
 from fcslam.ros.live_plan import Notify
 from fcslam.ros.network import RosNetwork
 from fcslam.ros.topics import SensorTopics
@@ -48,15 +49,13 @@ def record(
             file = place / f"{place.name}.mcap"
             try:
                 writer.open()
-                while (message := inbox.get(POLL_S)) is not None or not stop.is_set():
-                    if message is not None:
-                        topic = message.topic
-                        if topic not in connections:
-                            name = full_name(kinds[topic])
-                            connections[topic] = writer.add_connection(topic, name, typestore=typestore(ros1=False))
-                        latest_ns = max(latest_ns, message.received_ns)  # the time of recording only ever grows
-                        writer.write(connections[topic], latest_ns, message.payload)
-                        counts[topic] += 1
+                for topic, payload, received_ns in _messages(inbox, stop):
+                    if topic not in connections:
+                        name = full_name(kinds[topic])
+                        connections[topic] = writer.add_connection(topic, name, typestore=typestore(ros1=False))
+                    latest_ns = max(latest_ns, received_ns)  # the time of recording only ever grows
+                    writer.write(connections[topic], latest_ns, payload)
+                    counts[topic] += 1
                 writer.close()
             except BaseException as error:
                 with suppress(Exception):
@@ -76,6 +75,16 @@ def record(
     if inbox.lost:
         notify(f"the disk is slower than the messages: {inbox.lost} were lost; record fewer topics, or on another disk")
     return counts
+
+
+def _messages(inbox: Inbox, stop: threading.Event) -> Iterator[ReceivedMessage]:
+    """The messages until ``stop``, and those that wait then: others keep coming."""
+    while not stop.is_set():
+        if (message := inbox.get(POLL_S)) is not None:
+            yield message
+    for _ in range(len(inbox)):
+        if (message := inbox.get(0.0)) is not None:
+            yield message
 
 
 def _part_of(output: Path) -> Path:

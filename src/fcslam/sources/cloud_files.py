@@ -6,7 +6,7 @@ the floor below the LiDAR.
 """
 
 from collections.abc import Iterator
-from datetime import datetime
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -181,6 +181,7 @@ def _seconds(text: str, file: Path) -> float:
     except ValueError:
         pass
     try:  # KITTI's raw data has nanoseconds
-        return datetime.fromisoformat(text[:26]).timestamp()
+        stamp = datetime.fromisoformat(text)
+        return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp()
     except ValueError as error:
         raise SourceError(f"{file}: {text!r} is not a time; give seconds, or dates as in KITTI") from error

@@ -40,6 +40,8 @@ def open_fleet(
     """
     sources: list[Source] = []
     for path, name in recordings:
+        if not isinstance(path, Path) and name not in (None, path.name):
+            raise SourceError(f"{name}: its recording is open under the name {path.name}; open it as {name}")
         source = open_source(path, options, name) if isinstance(path, Path) else path
         bag = bag_of(source) if isinstance(path, Path) else None
         sources += [source] if bag is None else bag.robots(name)

@@ -1,4 +1,6 @@
-"""Atomic writes: a file or a folder holds all of its old content or all of the new one, also after a power cut.
+"""Atomic writes: a file or a folder holds all of its old content or all of the new one.
+
+A file of ``write_file`` does so also after a power cut.
 
 A folder is replaced in two steps. A process that is killed between them leaves none; ``bring_back`` undoes the first.
 """
