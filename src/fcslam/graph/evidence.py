@@ -20,6 +20,8 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.records import Reason, ReasonCode
 
+DISTINCT_M, DISTINCT_RAD = 1.0, 0.26
+"""Two transforms of one place or map that differ by more, metres or radians, are two."""
 LEAST_COMPARED_M = 5.0
 """Least ``MapFit.compared_m`` that refutes a transform."""
 LARGEST_CONTRADICTION = 0.01

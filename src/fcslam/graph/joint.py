@@ -21,7 +21,7 @@ from fcslam.graph.cluster import (
     relative_frame,
 )
 from fcslam.graph.consistency import Closures, count_supporting_closures
-from fcslam.graph.evidence import ConsistencySettings, MapFit, shortfall
+from fcslam.graph.evidence import DISTINCT_M, DISTINCT_RAD, ConsistencySettings, MapFit, shortfall
 from fcslam.graph.initialization import initialize
 from fcslam.graph.optimizer import INLIER_WEIGHT, Solution, optimize_gnc, refine_inliers
 from fcslam.graph.pose_graph import PoseGraph
@@ -39,9 +39,6 @@ shape (N, P) each."""
 
 _Relation = tuple[int, int, FloatArray]
 """Two robots a and b, and the transform T_a_b between their own frames, shape (P,)."""
-
-PREDICTED_M, PREDICTED_RAD = 1.0, 0.26
-"""Largest median difference between a cluster and the transform that other links predict."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,7 +270,7 @@ def _merge_frames(
         T_map_j = group.compose(frames[link.b], own[link.b].poses[members.j])
         off = group.to_plane(group.between(group.between(T_map_i, T_map_j), members.T_i_j))
         x, y, theta = np.median(np.abs(off), axis=0)
-        return bool(np.hypot(x, y) <= PREDICTED_M and theta <= PREDICTED_RAD)
+        return bool(np.hypot(x, y) <= DISTINCT_M and theta <= DISTINCT_RAD)
 
     for relation in known:
         merge(*relation)

@@ -15,7 +15,7 @@ from fcslam.learning.code_batches import RevisitBatch
 from fcslam.learning.network import Description, Maps, sample_codes
 from fcslam.learning.settings import Encoder, Losses
 
-MIN_NEGATIVE_DISTANCE_PX = 8.0
+MIN_NEGATIVE_DISTANCE_PX = float(CELL_PX)
 """Points closer to a match than this are not negatives, because their codes should be similar."""
 SHARPNESS = 2.0
 """Log odds of a bit for one standard deviation of a teacher's projection, or for a code's logit of 1: 88 %."""

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.features.dense import CELL_PX
 from fcslam.features.detector import GreyImage
 from fcslam.learning.homography import Mask, Size
 from fcslam.records import FloatArray
@@ -18,8 +19,8 @@ SMALL_TURN_RAD: Final = 0.2
 """Standard deviation of a view's rotation."""
 ANY_TURN_SHARE: Final = 0.1
 """Share of views that are rotated by any angle: robots roll little, but cameras may be mounted at any angle."""
-LARGEST_SHIFT_PX: Final = 15
-"""Largest shift of a pair whose views differ by a shift, almost two cells of the network."""
+LARGEST_SHIFT_PX: Final = 2 * CELL_PX - 1
+"""Largest shift of a pair whose views differ by a shift: it takes a point into any place of a cell of the network."""
 
 
 def random_view(image: GreyImage, size: Size, rng: np.random.Generator) -> FloatArray:

@@ -6,7 +6,6 @@ look-up bounds the score of a whole square of shifts. Squares whose bound is bel
 
 import math
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +24,6 @@ MOST_LEVELS = 6
 """Most levels of the pyramid; a step on the coarsest one of them is 2^5 cells."""
 MOST_POINTS = 120
 """Largest number of points that are scored."""
-CHECKED_AFTER: Final = 8
-"""Points after which the search looks whether the rest can still reach the best score."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +192,7 @@ def _bound(cells, level, width, sx, sy, needed):  # type: ignore[no-untyped-def]
         # A square that begins before the grid may reach into it.
         if x > -width and y > -width and x < columns and y < rows:
             total += level[max(y, 0), max(x, 0)]
-        if i % CHECKED_AFTER == 0 and total + 255 * (len(cells) - i) <= needed:
+        if total + 255 * (len(cells) - i) <= needed:
             return total
     return total
 

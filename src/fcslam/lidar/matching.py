@@ -141,8 +141,8 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter, tail):  # t
     complement eliminates v.
     """
     pose, velocity = guess.copy(), np.zeros(3)
-    equations = _Equations(np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.zeros((4, 3)))
-    H, g, reduced = equations.H, equations.g, equations.reduced
+    H, g, mixed, own, reduced = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.zeros((4, 3))
+    equations = H, g, mixed, own, reduced
     new_weight = _weight_of_new(scan, pose, field)
     scale = wide
     for _ in range(MOST_ITERATIONS):
@@ -194,21 +194,13 @@ def solve(A, b):  # type: ignore[no-untyped-def]
     return b[0] / A[0, 0] - l10 * y - l20 * z, y, z
 
 
-class _Equations(NamedTuple):
-    """Normal equations over the pose, without the velocity, in units of ``POINT_SIGMA_M``.
-
-    The velocity that minimises the cost is moved by row 3 of ``reduced`` less the step of the pose times rows 0 to 2.
-    """
-
-    H: FloatArray  # (3, 3)
-    g: FloatArray  # (3,)
-    mixed: FloatArray  # (3, 3): block of pose and velocity
-    own: FloatArray  # (3, 3): block of the velocity, with its prior
-    reduced: FloatArray  # (4, 3)
-
-
 @njit(allocates=False)
 def _normal_equations(equations, scan, pose, velocity, field, loss, velocity_prior):  # type: ignore[no-untyped-def]
+    """Write the normal equations over the pose, without the velocity, in units of ``POINT_SIGMA_M``, into H and g.
+
+    ``mixed`` is the block of pose and velocity, ``own`` that of the velocity, with its prior. The velocity that
+    minimises the cost is moved by row 3 of ``reduced`` (4, 3) less the step of the pose times rows 0 to 2.
+    """
     H, g, mixed, own, reduced = equations
     own_pose, mixed_sums, own_velocity, moment, velocity_moment = _sums(scan, pose, velocity, field, loss)
     s2 = 1.0 / (POINT_SIGMA_M * POINT_SIGMA_M)

@@ -15,6 +15,7 @@ from scipy.ndimage import distance_transform_edt
 
 from fcslam.compiled import njit
 from fcslam.geometry import se2
+from fcslam.graph.evidence import DISTINCT_M, DISTINCT_RAD
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, Submap, agreement
 from fcslam.lidar.verification import ALIGNED_POINTS, ALIGNMENT_SCALE_M
@@ -28,8 +29,6 @@ WELL_INSIDE_M = 2.0 * CELL_M
 """A point in free space farther than this from any surface contradicts it, in the exhaustive search."""
 VIOLATION_WEIGHT = 2.0
 """Metres of explained surface that a metre of surface in free space cancels."""
-ELSEWHERE_M, ELSEWHERE_RAD = 1.0, np.radians(15.0)
-"""Transforms this far apart are two."""
 PEAKS = 3
 """Best positions that are kept for each heading."""
 REFINED = 4 * PEAKS
@@ -127,7 +126,7 @@ def is_elsewhere(one: FloatArray, other: FloatArray, middle: FloatArray) -> bool
     """Whether two transforms T_a_b put the middle (1, 2) of b at two places, or turn b differently."""
     gap = se2.transform(one, middle) - se2.transform(other, middle)
     turn = abs(se2.wrap_angle(one[2] - other[2]))
-    return bool(np.linalg.norm(gap) > ELSEWHERE_M or turn > ELSEWHERE_RAD)
+    return bool(np.linalg.norm(gap) > DISTINCT_M or turn > DISTINCT_RAD)
 
 
 Drawing = tuple[FloatArray, FloatArray]

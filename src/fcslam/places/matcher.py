@@ -16,11 +16,12 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.geometry import se2
+from fcslam.graph.evidence import DISTINCT_M, DISTINCT_RAD
 from fcslam.lidar.pair_verification import Pair, VerifyPairs, verify_here
 from fcslam.lidar.submap import Submap, agreement
 from fcslam.lidar.verification import LOOSE, NO_PRIOR, Verification
 from fcslam.places.index import PlaceIndex, QueryResult
-from fcslam.places.motions import DISTINCT_M, DISTINCT_RAD, Motion, propose_motions
+from fcslam.places.motions import Motion, propose_motions
 from fcslam.places.similarity import PAPER_SCALE
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import Channel, ClosureStatus, FloatArray, KeyscanId, LoopClosure, Place, Reason, ReasonCode, frozen
@@ -29,7 +30,7 @@ from fcslam.storage.state_file import State
 START_SHARE = 1.0 / 3.0
 """Share of the points of the loose gate that is enough where known starts predict a closure."""
 NO_DESCRIPTORS = np.zeros((0, 32), np.uint8)
-PLAUSIBLE_VIOLATION: Final = 0.1
+PLAUSIBLE_VIOLATION: Final = LOOSE.violation
 """Largest share of a new place's points in the free space of the stored one, at the motion that keypoints propose and
 before any alignment. In simulations, 98 % of the true motions have less; a noisy real scanner has up to 0.14."""
 MOST_DOUBTFUL: Final = 12

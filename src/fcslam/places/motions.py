@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from fcslam.compiled import njit
 from fcslam.features.codes import LARGEST_HAMMING, Matches, mutual_matches
 from fcslam.geometry import se2
+from fcslam.graph.evidence import DISTINCT_M, DISTINCT_RAD
 from fcslam.records import Channel, FloatArray, Place, frozen
 
 _REFINEMENTS = 5
@@ -26,10 +27,6 @@ MINIMUM_INLIERS = 4
 """Fewest inliers of a motion hypothesis."""
 MOST_HYPOTHESES = 2
 """Most motion hypotheses of a pair of places."""
-DISTINCT_M = 1.0
-"""Distance of two motions, in metres, from which on they are distinct."""
-DISTINCT_RAD = 0.26
-"""Angle between two motions, in radians, from which on they are distinct."""
 INDEPENDENT_KEYPOINTS: Final = 10
 """Most independent keypoints of one image. The errors of its keypoints are correlated, because they share one scan and
 one robot pose, so more keypoints do not add information."""

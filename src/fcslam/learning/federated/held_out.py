@@ -16,7 +16,7 @@ from fcslam.features.codes import LARGEST_HAMMING, mutual_matches
 from fcslam.features.detector import ImageFeatures, OnnxConfig
 from fcslam.geometry import se2
 from fcslam.learning.network import KeypointNetwork
-from fcslam.learning.revisits import Keyframe, correspond, revisits_in_map
+from fcslam.learning.revisits import FARTHEST_M, Keyframe, correspond, revisits_in_map
 from fcslam.learning.validation import detect
 from fcslam.places.motions import level_matches, rigid_hypotheses
 from fcslam.records import FloatArray, frozen
@@ -24,7 +24,7 @@ from fcslam.records import FloatArray, frozen
 COLUMNS: Final = ("revisit_recall", "places_found")
 """Columns that a robot reports about each pair: right matches as a share of the shared points, and whether the pair is
 more similar than any two keyframes of different places."""
-APART_M: Final = 8.0
+APART_M: Final = 2.0 * FARTHEST_M
 """Keyframes farther apart than this show different places."""
 MOST_APART: Final = 300
 """Pairs of keyframes of different places that are compared."""
