@@ -4,9 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fcslam.records import CameraModel, Transform
+from fcslam.records import CameraModel
 from fcslam.sources.bags.codec import COMPRESSED_IMAGE
 from fcslam.sources.bags.messages import header_of
+from fcslam.sources.bags.transforms import IDENTITY
 from fcslam.untrusted import LimitError, image_size
 
 MAX_IMAGE_BYTES = 1 << 25
@@ -29,17 +30,9 @@ class Calibration(NamedTuple):
     """sensor_msgs/CameraInfo."""
 
     frame: str
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    camera: CameraModel
+    """Mounted nowhere yet."""
     is_distorted: bool
-
-    def camera(self, T_base_camera: Transform) -> CameraModel:
-        """The camera model with this mounting."""
-        return CameraModel(self.width, self.height, self.fx, self.fy, self.cx, self.cy, T_base_camera)
 
 
 def image_of(content: Any, kind: str, bag_time_ns: int) -> ImageMessage:
@@ -84,7 +77,8 @@ def calibration_of(content: Any) -> Calibration:
         raise ValueError(f"width and height must be 1 to {MAX_SIDE_PX} pixels")
     if not (fx > 0.0 and fy > 0.0 and np.isfinite(K).all()):
         raise ValueError("fx, fy, cx and cy must be numbers of pixels, the first two positive")
-    return Calibration(frame, content.width, content.height, fx, fy, cx, cy, bool(np.any(D)))
+    camera = CameraModel(content.width, content.height, fx, fy, cx, cy, IDENTITY)
+    return Calibration(frame, camera, bool(np.any(D)))
 
 
 def image_suffix(encoded: bytes) -> str:

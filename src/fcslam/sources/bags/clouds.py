@@ -195,6 +195,6 @@ def _depth_points(content: Any, calibration: Calibration | None) -> FloatArray:
         raise ValueError("the pixels do not fill the image")
     rows = np.frombuffer(content.data, np.uint8).reshape(height, step)[:, : width * pixel.itemsize]
     depth_m = np.ascontiguousarray(rows).view(pixel).astype(np.float64) * unit_m
-    fx, fy = calibration.fx * width / calibration.width, calibration.fy * height / calibration.height
-    cx, cy = calibration.cx * width / calibration.width, calibration.cy * height / calibration.height
-    return depth_points(depth_m, fx, fy, cx, cy)
+    camera = calibration.camera
+    across, down = width / camera.width, height / camera.height  # of images that were made smaller
+    return depth_points(depth_m, camera.fx * across, camera.fy * down, camera.cx * across, camera.cy * down)

@@ -176,7 +176,7 @@ def mounted_camera(
     if calibration is None:
         return None, "was never calibrated, it is left out"
     try:
-        camera = calibration.camera(tree.fixed(base_frame, calibration.frame))
+        camera = replace(calibration.camera, T_base_camera=tree.fixed(base_frame, calibration.frame))
     except NoTransformError as error:
         return None, f"is left out, as tf has {error}"
     return camera, "has distorted images, read as if they were not" if calibration.is_distorted else ""
