@@ -8,7 +8,7 @@ rooms is seen from both: rays that hit its surfel from behind belong to the othe
 Only the direction of its normal counts for a point, so that a plain corridor does not fix the position along it.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,53 +31,46 @@ _UNEVEN: Final = 0.02
 _OFFSET = 1 << 19
 
 
+class _Table(NamedTuple):
+    """Voxels by row, and their rows by hashed keys."""
+
+    keys: NDArray[np.int64]
+    """-1: no voxel."""
+    rows: NDArray[np.int32]
+    row_keys: NDArray[np.int64]
+    """Key of each row."""
+    stats: FloatArray
+    """Of each voxel: the number of its points, and the sums of them, of their products and of their rays."""
+    planes: FloatArray
+    """Normal, middle, variance along the normal (0: there is no surfel), and variance of the normal."""
+    seen: FloatArray
+    """When it was seen last."""
+
+
 class SurfelMap:
     """Voxels with their points' moments; forgets those that were not seen for a while."""
 
     def __init__(self) -> None:
-        self._keys, self._rows = _table(1 << 12)
-        self._stats = np.zeros((1 << 10, 13))
-        """Of each voxel: the number of its points, and the sums of them, of their products and of their rays."""
-        self._planes = np.zeros((1 << 10, 8))
-        """Normal, middle, variance along the normal (0: there is no surfel), and variance of the normal."""
-        self._seen = np.zeros(1 << 10)
-        self._row_keys = np.zeros(1 << 10, np.int64)
+        self._table = _table(1 << 10)
         self.count = 0
 
     def add(self, points: FloatArray, rays: FloatArray, when: float) -> None:
         """Add points (N, 3), and the directions of their rays (N, 3), in the map's frame; ``when`` grows."""
         needed = self.count + 2 * len(SIZES_M) * len(points)
-        if needed > len(self._stats):
-            size = max(needed, 2 * len(self._stats))
-            for name in ("_stats", "_planes", "_seen", "_row_keys"):
-                old = getattr(self, name)
-                new = np.zeros((size, *old.shape[1:]), old.dtype)
-                new[: self.count] = old[: self.count]
-                setattr(self, name, new)
-        if 2 * needed > len(self._keys):
-            self._keys, self._rows = _table(1 << int(2 * needed).bit_length())
-            _reindex(self._keys, self._rows, self._row_keys, self.count)
-        self.count = _add(
-            self._keys,
-            self._rows,
-            self._row_keys,
-            self._stats,
-            self._planes,
-            self._seen,
-            self.count,
-            points,
-            rays,
-            when,
-        )
+        if needed > len(self._table.seen):
+            self._keep(np.arange(self.count), max(needed, 2 * len(self._table.seen)))
+        self.count = _add(self._table, self.count, points, rays, when)
 
     def forget(self, before: float) -> None:
         """Forget voxels that were seen last before this."""
-        kept = np.flatnonzero(self._seen[: self.count] >= before)
-        for name in ("_stats", "_planes", "_seen", "_row_keys"):
-            setattr(self, name, getattr(self, name)[kept])
-        self.count = len(kept)
-        self._keys, self._rows = _table(1 << max(12, int(4 * self.count).bit_length()))
-        _reindex(self._keys, self._rows, self._row_keys, self.count)
+        kept = np.flatnonzero(self._table.seen[: self.count] >= before)
+        self._keep(kept, max(1 << 10, len(kept)))
+
+    def _keep(self, rows: NDArray[np.int64], capacity: int) -> None:
+        old, self._table, self.count = self._table, _table(capacity), len(rows)
+        for before, now in zip(old[2:], self._table[2:], strict=True):
+            now[: len(rows)] = before[rows]
+        _reindex(self._table, len(rows))
 
     def normal_equations(
         self,
@@ -98,30 +91,17 @@ class SurfelMap:
             corrections: (2, 6), tangents at that pose: of the begin and of the end; between, they are interpolated.
             gate_m: largest distance of a point from its surfel.
         """
-        H, b, along, moments = np.zeros((12, 12)), np.zeros(12), np.zeros((6, 6)), np.zeros((4, 4))
-        found = _accumulate(
-            self._keys,
-            self._rows,
-            self._planes,
-            points,
-            shares,
-            rotation,
-            position,
-            corrections,
-            gate_m,
-            H,
-            b,
-            along,
-            moments,
-        )
+        H, b, along, moments, found = _accumulate(self._table, points, shares, rotation, position, corrections, gate_m)
         # errors of a normal are in its plane: those in all directions without those along it
         unit, across, squares = np.eye(3), np.cross(moments[0, 1:], np.eye(3)), moments[1:, 1:]
         every = np.block([[moments[0, 0] * unit, across], [across.T, np.trace(squares) * unit - squares]])
         return H, b, every - along, found
 
 
-def _table(size: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    return np.full(size, -1, np.int64), np.zeros(size, np.int32)
+def _table(capacity: int) -> _Table:
+    size = 1 << int(2 * capacity).bit_length()
+    columns = np.zeros((capacity, 13)), np.zeros((capacity, 8)), np.zeros(capacity)
+    return _Table(np.full(size, -1, np.int64), np.zeros(size, np.int32), np.zeros(capacity, np.int64), *columns)
 
 
 @njit(allocates=False)
@@ -142,14 +122,15 @@ def _slot(keys, key):  # type: ignore[no-untyped-def]
 
 
 @njit
-def _reindex(keys, rows, row_keys, count):  # type: ignore[no-untyped-def]
+def _reindex(table, count):  # type: ignore[no-untyped-def]
     for row in range(count):
-        at = _slot(keys, row_keys[row])
-        keys[at], rows[at] = row_keys[row], row
+        at = _slot(table.keys, table.row_keys[row])
+        table.keys[at], table.rows[at] = table.row_keys[row], row
 
 
 @njit
-def _add(keys, rows, row_keys, stats, planes, seen, count, points, rays, when):  # type: ignore[no-untyped-def]
+def _add(table, count, points, rays, when):  # type: ignore[no-untyped-def]
+    keys, rows, row_keys, stats, planes, seen = table
     touched = np.empty(len(points) * len(SIZES_M), np.int32)
     n_touched = 0
     for p in range(len(points)):
@@ -226,8 +207,9 @@ def _fit_planes(stats, planes, rows):  # type: ignore[no-untyped-def]
 
 
 @njit(allocates=False)
-def _surfel(keys, rows, planes, x, y, z, rx, ry, rz):  # type: ignore[no-untyped-def]
+def _surfel(table, x, y, z, rx, ry, rz):  # type: ignore[no-untyped-def]
     """Row of the surfel of the largest voxel around a point that faces a ray; -1 without one."""
+    keys, rows, _, _, planes, _ = table
     for level in range(len(SIZES_M)):
         for side in range(2):
             key = _key(level, x, y, z, side)
@@ -240,33 +222,42 @@ def _surfel(keys, rows, planes, x, y, z, rx, ry, rz):  # type: ignore[no-untyped
     return -1
 
 
+@njit(allocates=False)
+def corrected(point, share, corrections):  # type: ignore[no-untyped-def]
+    """A point at a share of a turn after the corrections (2, 6) of its begin and its end.
+
+    The exponential of the interpolated correction is taken to second order.
+    """
+    a, (x, y, z) = share, point
+    vx = (1.0 - a) * corrections[0, 0] + a * corrections[1, 0]
+    vy = (1.0 - a) * corrections[0, 1] + a * corrections[1, 1]
+    vz = (1.0 - a) * corrections[0, 2] + a * corrections[1, 2]
+    wx = (1.0 - a) * corrections[0, 3] + a * corrections[1, 3]
+    wy = (1.0 - a) * corrections[0, 4] + a * corrections[1, 4]
+    wz = (1.0 - a) * corrections[0, 5] + a * corrections[1, 5]
+    ux, uy, uz = wy * z - wz * y + vx, wz * x - wx * z + vy, wx * y - wy * x + vz
+    return (
+        x + ux + 0.5 * (wy * uz - wz * uy),
+        y + uy + 0.5 * (wz * ux - wx * uz),
+        z + uz + 0.5 * (wx * uy - wy * ux),
+    )
+
+
 @njit
-def _accumulate(keys, rows, planes, points, shares, R, t, corrections, gate_m, H, b, along, moments):  # type: ignore[no-untyped-def]
+def _accumulate(table, points, shares, R, t, corrections, gate_m):  # type: ignore[no-untyped-def]
+    H, b, along, moments = np.zeros((12, 12)), np.zeros(12), np.zeros((6, 6)), np.zeros((4, 4))
     J, q, found = np.empty(6), np.ones(4), 0
     for p in range(len(points)):
         a = shares[p]
-        vx = (1.0 - a) * corrections[0, 0] + a * corrections[1, 0]
-        vy = (1.0 - a) * corrections[0, 1] + a * corrections[1, 1]
-        vz = (1.0 - a) * corrections[0, 2] + a * corrections[1, 2]
-        wx = (1.0 - a) * corrections[0, 3] + a * corrections[1, 3]
-        wy = (1.0 - a) * corrections[0, 4] + a * corrections[1, 4]
-        wz = (1.0 - a) * corrections[0, 5] + a * corrections[1, 5]
-        x, y, z = points[p]
-        # exp of the correction to second order
-        ux, uy, uz = wy * z - wz * y + vx, wz * x - wx * z + vy, wx * y - wy * x + vz
-        x, y, z = (
-            x + ux + 0.5 * (wy * uz - wz * uy),
-            y + uy + 0.5 * (wz * ux - wx * uz),
-            z + uz + 0.5 * (wx * uy - wy * ux),
-        )
+        x, y, z = corrected(points[p], a, corrections)
         rx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
         ry = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
         rz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
         X, Y, Z = rx + t[0], ry + t[1], rz + t[2]
-        row = _surfel(keys, rows, planes, X, Y, Z, rx, ry, rz)
+        row = _surfel(table, X, Y, Z, rx, ry, rz)
         if row < 0:
             continue
-        n = planes[row]
+        n = table.planes[row]
         r = n[0] * (X - n[3]) + n[1] * (Y - n[4]) + n[2] * (Z - n[5])
         if abs(r) > gate_m:
             continue
@@ -295,4 +286,4 @@ def _accumulate(keys, rows, planes, points, shares, R, t, corrections, gate_m, H
                 H[i, 6 + j] += c0 * c1 * v
                 H[6 + i, j] += c0 * c1 * v
                 H[6 + i, 6 + j] += c1 * c1 * v
-    return found
+    return H, b, along, moments, found

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fcslam.compiled import njit
 from fcslam.geometry import se3
 from fcslam.lidar3d.motion import MotionSensors
-from fcslam.lidar3d.surfels import POINT_SIGMA_M, SIZES_M, SurfelMap
+from fcslam.lidar3d.surfels import POINT_SIGMA_M, SIZES_M, SurfelMap, corrected
 from fcslam.records import CloudScan, FloatArray
 from fcslam.sources.point_clouds import FARTHEST_M
 
@@ -303,17 +303,10 @@ def _deskew(points, shares, poses):  # type: ignore[no-untyped-def]
 
 @njit
 def _corrected(points, shares, corrections):  # type: ignore[no-untyped-def]
-    """Points (N, 3) with the corrections (2, 6) of the begin and the end, by the exponential to second order."""
+    """Points (N, 3) with the corrections (2, 6) of the begin and the end of their turn."""
     moved = np.empty((len(points), 3))
     for p in range(len(points)):
-        a = shares[p]
-        vx, vy, vz = (1.0 - a) * corrections[0, :3] + a * corrections[1, :3]
-        wx, wy, wz = (1.0 - a) * corrections[0, 3:] + a * corrections[1, 3:]
-        x, y, z = points[p]
-        ux, uy, uz = wy * z - wz * y + vx, wz * x - wx * z + vy, wx * y - wy * x + vz
-        moved[p, 0] = x + ux + 0.5 * (wy * uz - wz * uy)
-        moved[p, 1] = y + uy + 0.5 * (wz * ux - wx * uz)
-        moved[p, 2] = z + uz + 0.5 * (wx * uy - wy * ux)
+        moved[p] = corrected(points[p], shares[p], corrections)
     return moved
 
 
