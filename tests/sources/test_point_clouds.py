@@ -102,10 +102,12 @@ def test_the_returns_of_a_sparse_scanner_are_neighbours(columns, directions, clo
     assert point_scan(scan.raw_ranges_m, laser).normals.any(axis=1).mean() > 0.8
 
 
-@pytest.mark.parametrize("wrong_s", [60.0, 4.2, 0.5, -1.0, math.nan])
-def test_points_with_wrong_times_are_left_out(wrong_s):
+@pytest.mark.parametrize(
+    ("wrong_s", "share"), [(60.0, 0.1), (4.2, 0.1), (0.5, 0.1), (-1.0, 0.1), (math.nan, 0.1), (60.0, 0.4), (4.2, 0.3)]
+)
+def test_points_with_wrong_times_are_left_out(wrong_s, share):
     measured = spinning(at_rest, first_rad=0.7)
-    lost = np.random.default_rng(1).random(len(measured.times)) < 0.1
+    lost = np.random.default_rng(1).random(len(measured.times)) < share
     message = cloud(STAMP, Measured(measured.points, np.where(lost, wrong_s, measured.times)), VELODYNE)
     assert cloud_of(message, POINT_CLOUD, 0).left_out == np.count_nonzero(lost)
     scan = read(message)

@@ -28,6 +28,8 @@ _LONGEST_IN_SECONDS: Final = 0.9
 """Times of points that are seconds span less: from 0 to 1 they are shares of a turn."""
 _REACH: Final = 4.0
 """Times farther from the middle half of all than this many times its duration are wrong, as of lost packets."""
+_SCATTERED: Final = 20.0
+"""Ratio of the middle half of all times to the shortest half that no turn has."""
 _DEPTHS: Final = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
 """Type and unit of the pixels of a depth image, by its encoding."""
 _OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -161,12 +163,19 @@ def timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
     known = np.isfinite(times)
     if not known.any():
         return cloud
-    after = (times - np.sort(times[known])[np.count_nonzero(known) // 2]).astype(np.float64)
-    low, high = np.quantile(after[known], (0.25, 0.75)).tolist()  # the middle half shows the unit
+    half = np.count_nonzero(known) // 2
+    after = (times - np.sort(times[known])[half]).astype(np.float64)
+    ordered = np.sort(after[known])
+    low, high = np.quantile(ordered, (0.25, 0.75)).tolist()
+    widths = ordered[half:] - ordered[: len(ordered) - half]
+    shortest = int(np.argmin(widths))
+    if 0.0 < widths[shortest] * _SCATTERED < high - low:  # wrong times are in the middle half, too
+        low, high = float(ordered[shortest]), float(ordered[shortest + half])
     if low == high:
         return cloud
     is_near = np.abs(after - 0.5 * (low + high)) < (0.5 + _REACH) * (high - low)  # false for NaN
     points, times, after = cloud.points[is_near], times[is_near], after[is_near]
+    low, high = np.quantile(after, (0.25, 0.75)).tolist()  # they show the unit
     cloud = cloud._replace(points=points, left_out=int(np.count_nonzero(~is_near)))
     for unit_s in _UNITS_S:
         most_s = min(longest_s, _LONGEST_IN_SECONDS) if unit_s == 1.0 else longest_s
