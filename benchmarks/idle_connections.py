@@ -29,8 +29,8 @@ import numpy as np
 from processes import cloud
 
 from fcslam.robot.sender import SEND_INTERVAL_S
+from fcslam.service.authentication import Role
 from fcslam.service.credentials import TOKEN, folder_of, make_credentials
-from fcslam.service.http.authentication import Role
 from fcslam.service.http.protocol import allow_many_connections
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, write_batch
 

@@ -18,8 +18,8 @@ from fastapi import Depends
 from fastapi.routing import APIRoute
 
 from fcslam.cli import app as command_line
+from fcslam.service.authentication import Role
 from fcslam.service.http.app import PREFIX, create_app
-from fcslam.service.http.authentication import Role
 from fcslam.service.http.state import ServiceState
 
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"

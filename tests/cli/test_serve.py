@@ -24,7 +24,11 @@ from cryptography.hazmat.primitives.serialization import (
 )
 
 from fcslam.cli import main
+from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import CloudError
+from fcslam.mission.mission_store import MissionStore
+from fcslam.service.mission_folder import MissionFolder
+from fcslam.service.missions import FIRST
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.http_transport import HttpTransport
 from fcslam.wire.keys import Credentials
@@ -243,6 +247,16 @@ def test_a_service_without_tokens_answers_to_no_other_name(tmp_path, options):
         assert "6.6.6.6" not in audited[1]
     finally:
         service.stop()
+
+
+@pytest.mark.system
+def test_an_option_that_an_existing_mission_does_not_take_is_told(tmp_path, capfd):
+    folder = MissionFolder.of(tmp_path / "data", FIRST)
+    folder.path.mkdir(parents=True)
+    with closing(MissionStore(folder.store)) as store:
+        store.configure(CloudConfig())
+    Service(tmp_path / "data", "--3d").stop()
+    assert "mission 'mission' keeps its configuration" in capfd.readouterr().err
 
 
 @pytest.fixture(scope="module")

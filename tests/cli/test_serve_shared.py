@@ -36,6 +36,7 @@ def no_password(monkeypatch):
     [
         (f"mysql://me:{WRONG}@127.0.0.1/x", "write postgresql://USER@HOST:PORT/DATABASE"),
         (f"postgresql://me:{WRONG}@127.0.0.1:port/x", 'invalid integer value "port"'),
+        (f"postgresql://me@127.0.0.1/x?sslpassword={WRONG}", "use PGSERVICEFILE"),
         ("data/missions.db", "write postgresql://USER@HOST:PORT/DATABASE"),
     ],
 )

@@ -50,7 +50,7 @@ def test_poses_in_space_are_stored_by_a_mission_in_space_alone(desk):
     motion = replace(CLOSURE, robot="a", T_i_j=se3.from_plane(CLOSURE.T_i_j), information=np.eye(6))
     in_space = encode(replace(PACKETS[0], sequence=1000, body=motion))
     flat = Intake(desk.store, lambda: 0.0, lambda: 1e9, in_plane=True)
-    with pytest.raises(PlaneError, match="a: sends poses in space, and this mission is in the plane; begin one"):
+    with pytest.raises(PlaneError, match="a: sends poses in space, and this mission began in the plane"):
         flat.take("a", "x", write_batch([*DATA, in_space]), -1)
     assert desk.store.arrivals(0, 10) == []
     desk.take(*DATA, in_space)

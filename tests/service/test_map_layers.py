@@ -12,8 +12,7 @@ from fcslam.errors import InputError
 from fcslam.maps.exports import outlines
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
 from fcslam.page.report import ShownRun
-from fcslam.service.http.responses import MapLayer
-from fcslam.service.map_layers import MOST_LAYER_BYTES, layers_of, map_shapes, walls_of
+from fcslam.service.map_layers import MOST_LAYER_BYTES, MapLayer, layers_of, map_shapes, walls_of
 from tests.mission.test_map_changes import write_run
 
 PLAN = {

@@ -84,17 +84,19 @@ def test_a_mission_without_its_file_is_not_a_new_one(service, harm):
 
 def test_what_was_left_half_done_is_swept_away_and_the_rest_is_not(tmp_path):
     root = tmp_path / "data"
-    left = [root / ".importx1", root / ".exportx2", root / "detectors" / ".stagingx3"]
+    left = [root / ".importx1", root / ".exportx2"]
     kept = [root / "detectors" / "lost+found", root / "missions" / "old"]
     for folder in (*left, *kept):
         folder.mkdir(parents=True)
         (folder / "network.onnx").write_text("x")
     (kept[0] / "announced").write_text("v1")
-    (kept[1] / ".import.partial").write_text("half")
+    halves = [folder / ".one.partial" for folder in kept]
+    for half in halves:
+        half.write_text("half")
     missions = Missions(root, CloudConfig(), lambda: 0.0, lambda: 1e9, Launched)
     assert not any(folder.exists() for folder in left)
     assert all((folder / "network.onnx").exists() for folder in kept)
-    assert not (kept[1] / ".import.partial").exists()
+    assert not any(half.exists() for half in halves)
     assert missions.detectors.versions() == []
     assert missions.detectors.announced() == {}
     missions.close()

@@ -65,8 +65,8 @@ def serve(
     from fcslam.cluster.verifying import check_workers, is_cluster, verifying
     from fcslam.page.routes import page_router, report_router
     from fcslam.processes import keep_memory_trimmed
+    from fcslam.service.authentication import Authenticator, read_tokens
     from fcslam.service.http.app import create_app
-    from fcslam.service.http.authentication import Authenticator, read_tokens
     from fcslam.service.shared.missions import NAMED
     from fcslam.storage.files import keep_private
     from fcslam.warmup import is_cold, warm_up_decoding
@@ -90,6 +90,10 @@ def serve(
             state = serving.own_state(data, authenticator, given, workers)
         else:
             state = serving.shared_state(store, listening.getsockname()[1], data, authenticator, given, workers)
+        if (config or in_space) and state.mission.store.configure(given) != given:
+            print_line(
+                notices(), f"mission '{state.mission.name}' keeps its configuration; -c and --3d apply to new ones"
+            )
         serving.reload_on_hangup(state, tokens)
         if not report_uncached(notices(quiet)) and is_cold():
             print_line(notices(quiet), f"compiling, first start only: about {EVERYTHING_S} s until maps are drawn")

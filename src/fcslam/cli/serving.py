@@ -24,7 +24,7 @@ from fcslam.learning.federated.settings import RELEASE, FleetLearningSettings
 from fcslam.learning.settings import DETECTOR
 from fcslam.processes import Child, module_command
 from fcslam.service.audit_log import audit_file, audit_table
-from fcslam.service.http.authentication import Authenticator, read_tokens
+from fcslam.service.authentication import Authenticator, read_tokens
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer, allow_many_connections
 from fcslam.service.http.state import EventStream, ServiceState
 from fcslam.service.mission_folder import MissionFolder
@@ -90,8 +90,7 @@ def shared_state(
 
         missions: SharedMissions
         events = EventStream(lambda: missions.open_mission.name)
-        missions = SharedMissions(data, config, server, name, int(limit), launch, events.publish)
-        missions.closing = opened.pop_all().close
+        missions = SharedMissions(data, config, server, name, int(limit), launch, events.publish, opened)
         return ServiceState(missions, authenticator, events, audit)
 
 

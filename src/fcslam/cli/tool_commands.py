@@ -124,8 +124,8 @@ def certificates(
     import datetime
 
     from fcslam.cloud.sessions import check_robot
+    from fcslam.service.authentication import Role
     from fcslam.service.credentials import folder_of, make_cluster_credentials, make_credentials
-    from fcslam.service.http.authentication import Role
     from fcslam.wire.checks import check_name
 
     wanted = {Role.ROBOT: robot or [], Role.VIEWER: viewer or [], Role.ADMIN: admin or []}

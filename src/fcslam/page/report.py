@@ -10,6 +10,7 @@ import itertools
 import json
 import math
 import re
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -31,11 +32,11 @@ from fcslam.page import ASSETS, MODULES
 from fcslam.records import ClosureStatus
 from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, TRAJECTORIES
 from fcslam.runs.folder import MISSION
+from fcslam.service.authentication import Role
 from fcslam.service.http.app import PREFIX, VIEWER_ROUTERS
-from fcslam.service.http.authentication import Role
 from fcslam.service.http.problems import add_handlers
 from fcslam.service.http.state import EventStream
-from fcslam.service.intake import SessionState
+from fcslam.service.intake import Agents, SessionState
 from fcslam.service.viewed_mission import PacketCounts, ViewedMission, viewed_run
 
 MOST_CLOSURES = 5000
@@ -60,6 +61,7 @@ class ShownRun:
         self._copy = ExitStack()
         self.store = self._copy.enter_context(opened_copy(mission if mission.is_file() else None))
         """The run folder's mission file; without packets if it has none."""
+        self.agents = Agents(time.monotonic)  # no robot sends anything here
         self._packets = Counter((envelope.robot, envelope.epoch) for envelope in self.store.envelopes())
 
     def __enter__(self) -> Self:
@@ -72,14 +74,6 @@ class ShownRun:
         """Sessions of one robot or of all, by robot and epoch."""
         known = sorted({*self._packets, *map(robot_and_epoch, viewed_run(self.run_folder).trajectories)})
         return [SessionState(*session, self._packets[session]) for session in known if robot in (None, session[0])]
-
-    def last_heard_s(self, robot: str) -> float | None:  # noqa: ARG002
-        """None: no robot sends anything here."""
-        return None
-
-    def has_ended(self, robot: str) -> bool:  # noqa: ARG002
-        """None does here."""
-        return False
 
     def packet_counts(self) -> PacketCounts:
         """All packets of a finished run took effect."""

@@ -13,8 +13,8 @@ from starlette.concurrency import run_in_threadpool
 
 from fcslam.page import ASSETS, MODULES
 from fcslam.page.report import ReadOnly, report_html, viewer_app
+from fcslam.service.authentication import VIEWERS
 from fcslam.service.http.app import PREFIX
-from fcslam.service.http.authentication import VIEWERS
 from fcslam.service.http.middleware import local_names
 from fcslam.service.http.responses import unless_known
 from fcslam.service.http.state import ViewerState

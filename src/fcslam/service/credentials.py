@@ -25,7 +25,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fcslam.errors import InputError
-from fcslam.service.http.authentication import Role, TokenEntry, TokensFile, read_tokens
+from fcslam.service.authentication import Role, TokenEntry, TokensFile, read_tokens
 from fcslam.storage.files import write_file
 from fcslam.wire.keys import AUTHORITY, CERTIFICATE, TOKEN
 

@@ -6,9 +6,8 @@ from pathlib import Path
 
 from fcslam.features.detector_file import describe_detector_file
 from fcslam.records import PLACE_CHANNELS, Channel, DetectorFile
+from fcslam.storage.files import write_file
 
-STAGING = ".staging"
-"""Prefix of folders with networks that are not checked yet."""
 _ANNOUNCED = "announced"
 """File that names a channel's announced version."""
 
@@ -44,16 +43,14 @@ class DetectorStore:
 
     def announce(self, content: bytes) -> DetectorFile:
         """Add a network and announce it to the robots."""
-        self._root.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=self._root, prefix=STAGING) as folder:
-            staging = Path(folder) / "network.onnx"
-            staging.write_bytes(content)
-            file = describe_detector_file(staging)  # without the lock: it loads the network
-            place = self.path(file.channel, file.version)
-            place.parent.mkdir(exist_ok=True)
-            with self._lock:
-                staging.replace(place)
-                staging.write_text(file.version, encoding="utf-8")
-                staging.replace(place.parent / _ANNOUNCED)
-                self._announced[file.channel] = file
+        with tempfile.TemporaryDirectory() as folder:
+            unchecked = Path(folder) / "network.onnx"
+            unchecked.write_bytes(content)
+            file = describe_detector_file(unchecked)  # without the lock: it loads the network
+        place = self.path(file.channel, file.version)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with self._lock:
+            write_file(place, content)
+            write_file(place.parent / _ANNOUNCED, file.version)
+            self._announced[file.channel] = file
         return file

@@ -109,7 +109,7 @@ class Agents:
             self._held[robot] = agent, self._clock()
 
     def end(self, robot: str) -> None:
-        """Note that a robot ended: any agent may speak for it now."""
+        """Note that a robot ended, and has sent everything: any agent may speak for it now."""
         with self._lock:
             self._held[robot] = ENDED, self._clock()
 
@@ -141,7 +141,7 @@ class Intake:
         wall_clock: Callable[[], float],
         announced: Callable[[], Mapping[Channel, DetectorFile]] = dict,
         limits: ClaimLimits | None = None,
-        agents: "Agents | None" = None,
+        agents: Agents | None = None,
         most_waiting: int = MOST_WAITING,
         most_refused_bytes: int = MOST_REFUSED_BYTES,
         in_plane: bool = False,
@@ -156,7 +156,7 @@ class Intake:
         self._packet_rate = TokenBuckets(clock, limits.packets_per_s, burst)
         self._session_rate = TokenBuckets(clock, limits.sessions_per_hour / 3600.0, limits.sessions_per_hour)
         self._store, self._wall_clock, self._announced = store, wall_clock, announced
-        self._agents = agents or Agents(clock)
+        self.agents = agents or Agents(clock)
         self._lock = threading.Lock()
         self._log, self._arrivals = PacketLog(), 0
         self._released: deque[str] = deque()
@@ -183,7 +183,7 @@ class Intake:
             StoreError: the disk is full; nothing is stored.
         """
         check_robot(robot)
-        self._agents.hold(robot, agent)
+        self.agents.hold(robot, agent)
         self.follow()
         encoded = read_batch(batch)
         self._limit_packets(robot, encoded)
@@ -201,18 +201,6 @@ class Intake:
         epochs = sorted({epoch for _, epoch, _ in numbers}) or [s.epoch for s in self.sessions(robot)[-1:]]
         removed = bool(epochs) and is_removed(session_name(robot, epochs[-1]), in_force(self._store.edits()))
         return self._replies(robot, epochs, known_correction), refused, removed
-
-    def last_heard_s(self, robot: str) -> float | None:
-        """Seconds since the robot's last batch; None: never since the service started."""
-        return self._agents.silent_s(robot)
-
-    def end(self, robot: str) -> None:
-        """Note that a robot ended, and has sent everything."""
-        self._agents.end(robot)
-
-    def has_ended(self, robot: str) -> bool:
-        """Whether a robot ended, and has sent everything."""
-        return self._agents.has_ended(robot)
 
     def sessions(self, robot: str | None = None) -> list[SessionState]:
         """Sessions of one robot or of all, by robot and epoch."""
@@ -323,7 +311,7 @@ def _read(robot: str, data: bytes, in_plane: bool) -> StoredPacket:
         raise PacketError(f"{robot}: a {sized.label.kind} goes to a robot, not to the cloud")
     if in_plane and is_in_space(sized.packet.body):
         raise PlaneError(
-            f"{robot}: sends poses in space, and this mission is in the plane; begin one with `fcslam serve --3d`, "
-            "or start the robot without --3d"
+            f"{robot}: sends poses in space, and this mission began in the plane, which --3d does not change; create a "
+            "mission of a service that runs with --3d (POST /missions), or start the robot without --3d"
         )
     return as_stored(sized)

@@ -2,13 +2,17 @@
 
 import json
 from collections.abc import Callable, Mapping
+from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
+
+from pydantic import Field
 
 from fcslam.anchoring.anchors import PLAN_JSON, TAGS_JSON
 from fcslam.anchoring.deviations import DeviationKind
 from fcslam.anchoring.walls import wall_direction
+from fcslam.config import StrictModel
 from fcslam.errors import InputError, SourceError
 from fcslam.maps.changes import APPEARED, DISAPPEARED
 from fcslam.maps.exports import outlines
@@ -17,7 +21,6 @@ from fcslam.mission.map_changes import changes_of
 from fcslam.mission.mission_file import check_packets, stored_mission
 from fcslam.mission.mission_store import MissionStore
 from fcslam.runs import QUALITY, Run
-from fcslam.service.http.responses import MapLayer, MapShape
 from fcslam.service.viewed_mission import ViewedMission, viewed_run
 from fcslam.untrusted import LimitError, read_bytes, read_text
 
@@ -25,6 +28,30 @@ TAG_M: Final = 0.15
 """Half a side of the square that stands for a tag."""
 MOST_LAYER_BYTES: Final = 1 << 26
 """Largest file that is shown as a layer; as objects, it takes many times as much memory."""
+
+
+class MapLayer(StrEnum):
+    """What is drawn over a map."""
+
+    PLAN = "plan"
+    CHANGES = "changes"
+    TAGS = "tags"
+    QUALITY = "quality"
+
+
+class MapShape(StrictModel):
+    """A shape that is drawn over a map, and its label."""
+
+    kind: Literal["plan", "missing", "new", "moved", "appeared", "disappeared", "tag", "good", "bad"] = Field(
+        description="line of the floor plan; wall that only the plan or only the scans have, or that moved; surface "
+        "that appeared or disappeared since the first day; tag; square metre as accurate as the certificate asks, "
+        "or not"
+    )
+    path: str = Field(description="data of an SVG path, metres of the map")
+    text: str = ""
+    x: float = Field(default=0.0, description="of the label, metres of the map")
+    y: float = Field(default=0.0, description="of the label, metres of the map")
+
 
 _FILES: Final = {MapLayer.PLAN: PLAN_JSON, MapLayer.TAGS: TAGS_JSON, MapLayer.QUALITY: f"{QUALITY}.json"}
 

@@ -12,14 +12,14 @@ from fcslam.errors import InputError, StoreError
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Change, Edit, Undo
 from fcslam.runs.folder import is_run_folder
-from fcslam.service.detectors import STAGING, DetectorStore
-from fcslam.service.intake import Intake, SessionState
+from fcslam.service.detectors import DetectorStore
+from fcslam.service.intake import Agents, Intake, SessionState
 from fcslam.service.joint_maps import ServedJointMaps
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import RunningWorker
 from fcslam.service.viewed_mission import PacketCounts
 from fcslam.storage.database import translate_errors
-from fcslam.storage.files import replacing, write_file
+from fcslam.storage.files import write_file
 
 FIRST = "mission"
 """Name of a new service's first mission."""
@@ -61,6 +61,11 @@ class OpenMission:
         return self.folder.name
 
     @property
+    def agents(self) -> Agents:
+        """Who speaks for each robot, and since when it is silent."""
+        return self.intake.agents
+
+    @property
     def run_folder(self) -> Path | None:
         """The live run folder as it is now; None: the worker has written none yet."""
         return self.folder.live.resolve() if self.folder.live.exists() else None
@@ -78,14 +83,6 @@ class OpenMission:
         """Sessions of one robot or of all, by robot and epoch, whoever received their packets."""
         self.intake.follow()
         return self.intake.sessions(robot)
-
-    def last_heard_s(self, robot: str) -> float | None:
-        """Seconds since the robot's last batch; None: never since the service started."""
-        return self.intake.last_heard_s(robot)
-
-    def has_ended(self, robot: str) -> bool:
-        """Whether the robot said that it ends, and nothing since."""
-        return self.intake.has_ended(robot)
 
     def packet_counts(self) -> PacketCounts:
         """How far the packets of all robots are."""
@@ -182,14 +179,13 @@ class Missions:
             store.export(path)
 
     def import_mission(self, name: str, path: Path) -> None:
-        """Import a file that ``export`` wrote and ``check_mission`` passed; the open mission stays open."""
+        """Import a file below ``root`` that ``export`` wrote and ``check_mission`` passed, by moving it."""
         folder = MissionFolder.of(self.root, name)
         if folder.store.exists():
             raise InputError(f"mission '{name}' exists; choose another name")
         with translate_errors(folder.store):
             folder.path.mkdir(parents=True, exist_ok=True)
-            with replacing(folder.store) as unfinished:
-                shutil.copyfile(path, unfinished)
+            path.replace(folder.store)
 
     def close(self) -> None:
         """Close the open mission and unlock the folder."""
@@ -238,10 +234,9 @@ class Missions:
 
 def sweep(root: Path) -> None:
     """Remove unfinished files of a service that was killed; the folder is locked."""
-    left = [*root.glob(f"{IMPORT}*"), *root.glob(f"{EXPORT}*"), *(root / "detectors").glob(f"{STAGING}*")]
-    for path in left:
+    for path in (*root.glob(f"{IMPORT}*"), *root.glob(f"{EXPORT}*")):
         shutil.rmtree(path, ignore_errors=True)
-    for path in root.glob("missions/*/.*.partial"):
+    for path in root.glob("*/*/.*.partial"):
         path.unlink(missing_ok=True)
 
 

@@ -10,7 +10,7 @@ from fcslam.cloud.sessions import session_name
 from fcslam.mission.mission_store import MissionStore
 from fcslam.runs import Run, open_run
 from fcslam.runs.folder import identity
-from fcslam.service.intake import SessionState
+from fcslam.service.intake import Agents, SessionState
 
 
 class PacketCounts(NamedTuple):
@@ -51,14 +51,12 @@ class ViewedMission(Protocol):
     def store(self) -> MissionStore:
         """Packets, edits and corrections, for reading."""
 
+    @property
+    def agents(self) -> Agents:
+        """Who speaks for each robot, and since when it is silent."""
+
     def sessions(self, robot: str | None = None) -> list[SessionState]:
         """Sessions of one robot or of all, by robot and epoch."""
-
-    def last_heard_s(self, robot: str) -> float | None:
-        """Seconds since the robot's last batch; None: never."""
-
-    def has_ended(self, robot: str) -> bool:
-        """Whether the robot said that it ends, and nothing since."""
 
     def packet_counts(self) -> PacketCounts:
         """How far the packets of all robots are."""

@@ -202,7 +202,8 @@ def _checked(url: str) -> str:
     except ImportError as error:
         raise StoreError(f"{url}: needs psycopg; install it: pip install 'fcslam[postgres]' ({error})") from error
     try:
-        psycopg.conninfo.conninfo_to_dict(url)
+        if "sslpassword" in psycopg.conninfo.conninfo_to_dict(url):
+            raise StoreError("the store's address has an sslpassword, which messages would show; use PGSERVICEFILE")
     except psycopg.Error as error:
         raise StoreError("the store's address cannot be read; write postgresql://USER@HOST:PORT/DATABASE") from error
     return url

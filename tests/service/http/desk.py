@@ -14,8 +14,8 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.mission.mission_store import MissionStore
 from fcslam.records import Channel
 from fcslam.service.audit_log import audit_file
+from fcslam.service.authentication import Authenticator, Role, TokenEntry
 from fcslam.service.http.app import create_app
-from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
 from fcslam.service.http.state import EventStream, ServiceState
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import Missions

@@ -9,7 +9,7 @@ from fastapi.routing import APIRoute, iter_route_contexts
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fcslam.service.http.authentication import Authenticator, Role, TokenEntry
+from fcslam.service.authentication import Authenticator, Role, TokenEntry
 from tests.service.http.desk import A, Desk, put_detector
 
 pytestmark = pytest.mark.slow

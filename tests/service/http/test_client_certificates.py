@@ -7,8 +7,8 @@ import httpx
 import pytest
 
 from fcslam.errors import CloudError, UnavailableError
+from fcslam.service.authentication import Authenticator, Identity, Role, read_tokens
 from fcslam.service.credentials import make_credentials
-from fcslam.service.http.authentication import Authenticator, Identity, Role, read_tokens
 from fcslam.service.http.protocol import GuardedProtocol
 from fcslam.wire.http_transport import HttpTransport
 from fcslam.wire.keys import Credentials

@@ -12,9 +12,9 @@ import httpx
 import pytest
 import uvicorn
 
+from fcslam.service.authentication import Identity, Role
 from fcslam.service.credentials import make_credentials
 from fcslam.service.http import limits
-from fcslam.service.http.authentication import Identity, Role
 from fcslam.service.http.limits import KNOWN_AT_ONCE, RequestLimits
 from fcslam.service.http.protocol import GuardedProtocol, GuardedServer
 from tests.service.http.desk import A

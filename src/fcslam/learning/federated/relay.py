@@ -8,7 +8,7 @@ from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi import Path as InPath
 
 from fcslam.learning.federated.fleet_server import ANSWER_S, NUMBER_HEADER, PATH
-from fcslam.service.http.authentication import Role
+from fcslam.service.authentication import Role
 from fcslam.service.http.robots import Name
 from fcslam.service.http.state import ServiceState
 

@@ -13,7 +13,7 @@ from fcslam.cloud.edits import read_edit
 from fcslam.config import StrictModel
 from fcslam.errors import InputError, StoreError
 from fcslam.records import Change, Undo
-from fcslam.service.http.authentication import Role
+from fcslam.service.authentication import Role
 from fcslam.service.http.fleet import LOOK_S, edit_summary
 from fcslam.service.http.limits import json_body, read_body, read_json
 from fcslam.service.http.responses import DetectorSummary, EditSummary, Finalized, content, refusals

@@ -15,8 +15,8 @@ from prometheus_client import CONTENT_TYPE_LATEST
 import fcslam
 from fcslam.errors import StoreError
 from fcslam.service.audit_log import AuditEntry
+from fcslam.service.authentication import Role
 from fcslam.service.http.administration import administration_router
-from fcslam.service.http.authentication import Role
 from fcslam.service.http.fleet import event_router, fleet_router
 from fcslam.service.http.joint_maps import joint_map_router
 from fcslam.service.http.limits import RequestLimits

@@ -24,7 +24,7 @@ from fcslam.geometry.groups import SE3, group_of
 from fcslam.maps.palette import robot_colors
 from fcslam.records import Channel, ClosureStatus, Edit, FloatArray
 from fcslam.runs import ClosureRow, Run
-from fcslam.service.http.authentication import VIEWERS, Role
+from fcslam.service.authentication import VIEWERS, Role
 from fcslam.service.http.responses import (
     ClosureSummary,
     EditSummary,
@@ -165,7 +165,7 @@ def _sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
     store = mission.store
     mapped = {name: known for name, known in run_of(mission).trajectories.items() if len(known.stamps)}
     colors = robot_colors({session_name(*session[:2]) for session in mission.sessions()})
-    sessions, changes, heard_s = [], in_force(store.edits()), mission.last_heard_s(robot)
+    sessions, changes, heard_s = [], in_force(store.edits()), mission.agents.silent_s(robot)
     for session in mission.sessions(robot):
         name = session_name(robot, session.epoch)
         known, hello = mapped.get(name), store.newest_hello(robot, session.epoch)
@@ -195,7 +195,7 @@ def _sessions_of(mission: ViewedMission, robot: str) -> list[SessionSummary]:
                 removed=is_removed(name, changes),
                 detectors=dict(hello.detector_versions) if hello else {},
                 last_heard_s=heard_s,
-                ended=mission.has_ended(robot),
+                ended=mission.agents.has_ended(robot),
             )
         )
     return sessions

@@ -20,7 +20,7 @@ from fcslam.maps.joint_tiles import LARGEST_ANSWER
 from fcslam.maps.occupancy_map import FARTHEST_M, map_stem
 from fcslam.records import NAME
 from fcslam.runs import QUALITY
-from fcslam.service.http.authentication import Role
+from fcslam.service.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
 from fcslam.service.http.responses import file_of, refusals, unless_known
 from fcslam.service.http.robots import NETWORK, Name

@@ -11,7 +11,7 @@ from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, ValidationError
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from fcslam.service.http.authentication import Identity
+from fcslam.service.authentication import Identity
 from fcslam.service.http.responses import content
 
 LONGEST_JSON_BYTES = 64 * 2**10

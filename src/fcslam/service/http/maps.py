@@ -17,10 +17,8 @@ from fcslam.maps.exports import earth_frame, export_map, zipped
 from fcslam.maps.occupancy_map import HEADER_BYTES, area_of, map_stem
 from fcslam.maps.tiles import DEEPEST_ZOOM, finest_zoom, tile_png
 from fcslam.runs import CONFIG, METRICS, POSE_GRAPH, QUALITY, TRAJECTORIES
-from fcslam.service.http.authentication import VIEWERS
+from fcslam.service.authentication import VIEWERS
 from fcslam.service.http.responses import (
-    MapLayer,
-    MapShape,
     MapSummary,
     MapVerdictSummary,
     file_of,
@@ -30,7 +28,7 @@ from fcslam.service.http.responses import (
 )
 from fcslam.service.http.robots import Name
 from fcslam.service.http.state import ViewerState
-from fcslam.service.map_layers import layers_of, map_shapes, walls_of
+from fcslam.service.map_layers import MapLayer, MapShape, layers_of, map_shapes, walls_of
 from fcslam.service.viewed_mission import run_of
 from fcslam.untrusted import open_file, read_bytes
 

@@ -17,7 +17,7 @@ from fcslam.config import StrictModel
 from fcslam.errors import StoreError
 from fcslam.mission.mission_store import check_mission
 from fcslam.records import NAME
-from fcslam.service.http.authentication import Role
+from fcslam.service.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
 from fcslam.service.http.responses import MissionList, content, file_of, refusals
 from fcslam.service.http.robots import Name

@@ -1,9 +1,8 @@
 """The responses of the service, as OpenAPI describes them."""
 
 from collections.abc import Sequence
-from enum import StrEnum
 from hashlib import sha256
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import Field
 from starlette.requests import Request
@@ -12,6 +11,7 @@ from starlette.responses import Response
 from fcslam.config import StrictModel
 from fcslam.records import Channel, ClosureStatus, ReasonCode
 from fcslam.runs import Use
+from fcslam.service.map_layers import MapLayer
 
 _Model = TypeVar("_Model", bound=StrictModel)
 Point = Annotated[list[float], Field(min_length=2, max_length=2, description="x and y in metres")]
@@ -124,15 +124,6 @@ class ClosureSummary(StrictModel):
     explanation: str = Field(description="the reason with its numbers, as one clause")
 
 
-class MapLayer(StrEnum):
-    """What is drawn over a map."""
-
-    PLAN = "plan"
-    CHANGES = "changes"
-    TAGS = "tags"
-    QUALITY = "quality"
-
-
 class MapSummary(StrictModel):
     """Which robots share a map."""
 
@@ -159,20 +150,6 @@ class LearningRound(StrictModel):
     reason: str = Field(description="of the gate for releasing it or not; empty without a gate")
     losses: dict[str, float] = Field(description="by name, without a unit")
     measures: dict[str, float] = Field(description="of the evaluation, in [0, 1]; empty if the round was not evaluated")
-
-
-class MapShape(StrictModel):
-    """A shape that is drawn over a map, and its label."""
-
-    kind: Literal["plan", "missing", "new", "moved", "appeared", "disappeared", "tag", "good", "bad"] = Field(
-        description="line of the floor plan; wall that only the plan or only the scans have, or that moved; surface "
-        "that appeared or disappeared since the first day; tag; square metre as accurate as the certificate asks, "
-        "or not"
-    )
-    path: str = Field(description="data of an SVG path, metres of the map")
-    text: str = ""
-    x: float = Field(default=0.0, description="of the label, metres of the map")
-    y: float = Field(default=0.0, description="of the label, metres of the map")
 
 
 class MapVerdictSummary(StrictModel):

@@ -7,7 +7,7 @@ from fastapi.responses import FileResponse, Response
 from starlette.concurrency import run_in_threadpool
 
 from fcslam.records import NAME, Channel
-from fcslam.service.http.authentication import Role
+from fcslam.service.authentication import Role
 from fcslam.service.http.limits import read_body
 from fcslam.service.http.responses import (
     DetectorSummary,
@@ -71,7 +71,7 @@ def robot_router(state: ServiceState) -> APIRouter:
             mission = state.mission
             taken = mission.intake.take(robot, agent, body, correction)
             if ended:
-                mission.intake.end(robot)
+                mission.agents.end(robot)
             mission.worker.notify()
             return taken
 

@@ -14,8 +14,8 @@ from starlette.datastructures import Headers
 from starlette.types import Scope
 
 from fcslam.service.audit_log import AuditLog
+from fcslam.service.authentication import Authenticator, Identity, Role
 from fcslam.service.detectors import DetectorStore
-from fcslam.service.http.authentication import Authenticator, Identity, Role
 from fcslam.service.http.limits import WHO
 from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.missions import Missions, OpenMission

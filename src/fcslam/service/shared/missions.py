@@ -6,6 +6,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
@@ -160,34 +161,31 @@ class SharedMissions:
         most_missions: int,
         launch: Callable[[KnownMission, Lease], RunningWorker],
         listen: Callable[[str, int, str], None],
+        resources: ExitStack,
     ) -> None:
         """Take the instance's name, and create the first mission if the server has no mission.
 
-        Files in ``root`` are this instance's own, and can be made again from the store. The other arguments are those
-        of an ``Instance``.
+        Files in ``root`` are this instance's own, and can be made again from the store. ``resources`` are closed at
+        the end, from now on here. The other arguments are those of an ``Instance``.
         """
         self.root = root
-        self.closing: Callable[[], object] = lambda: None
-        """Called after the last mission is given up."""
         self._config, self._server = config, server
-        self._lock = locked(root)
-        try:
-            sweep(root)
-            for seen in root.glob(f"missions/*/{_SEEN}"):
-                shutil.rmtree(seen, ignore_errors=True)
-            self.detectors = SharedDetectors(root / "detectors", server)
-            self._registry = Registry(server, name, secrets.token_hex(8))
-            self._opening = threading.Lock()
-            self._opened: dict[str, SharedMission] = {}
-            self.detectors.follow()
-            follow = self.detectors.follow
-            self._instance = Instance(self._registry, name, most_missions, launch, listen, follow)
-            if not any(known.is_open for known in self._instance.known.values()):
-                self._open_first()
-            self._instance.start()
-        except BaseException:
-            self._lock.close()
-            raise
+        resources.enter_context(locked(root))
+        sweep(root)
+        for seen in root.glob(f"missions/*/{_SEEN}"):
+            shutil.rmtree(seen, ignore_errors=True)
+        self.detectors = SharedDetectors(root / "detectors", server)
+        self._registry = Registry(server, name, secrets.token_hex(8))
+        self._opening = threading.Lock()
+        self._opened: dict[str, SharedMission] = {}
+        self.detectors.follow()
+        follow = self.detectors.follow
+        self._instance = Instance(self._registry, name, most_missions, launch, listen, follow)
+        resources.callback(self._instance.close)
+        if not any(known.is_open for known in self._instance.known.values()):
+            self._open_first()
+        self._instance.start()
+        self._resources = resources.pop_all()
 
     @property
     def names(self) -> list[str]:
@@ -231,10 +229,8 @@ class SharedMissions:
         self._instance.look()
 
     def close(self) -> None:
-        """Give up all missions, for other instances to take, and unlock the folder."""
-        self._instance.close()
-        self._lock.close()
-        self.closing()
+        """Give up all missions, for other instances to take, unlock the folder, and close the resources."""
+        self._resources.close()
 
     def _open_first(self) -> None:
         try:
