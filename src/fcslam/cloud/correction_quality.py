@@ -6,7 +6,8 @@ from typing import ClassVar
 import numpy as np
 
 from fcslam.cloud.closure_log import ClosureLog
-from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD, JointGraph
+from fcslam.cloud.joint_graph import JointGraph
+from fcslam.graph.evidence import AGREES_M, AGREES_RAD
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import KeyscanId, Place
 from fcslam.storage.snapshot import Kept
@@ -66,4 +67,4 @@ class CorrectionQuality(Kept):
 
     def _fits(self, match: PlaceMatch) -> bool:
         off_m, off_rad = self._graph.innovation(match.i, match.j, match.T_i_j)
-        return off_m <= SURPRISE_M and off_rad <= SURPRISE_RAD
+        return off_m <= AGREES_M and off_rad <= AGREES_RAD

@@ -14,7 +14,7 @@ import numpy as np
 from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.edits import is_cut, is_removed, stamps_of
 from fcslam.cloud.joining import CONSISTENCY, decide_join, reevaluate
-from fcslam.cloud.joint_graph import AGREES_SIGMAS, SOLVED_SHARE, SURPRISE_M, SURPRISE_RAD, JointGraph
+from fcslam.cloud.joint_graph import AGREES_SIGMAS, SOLVED_SHARE, JointGraph
 from fcslam.cloud.map_comparison import GROWTH, MapComparison
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.session_store import SessionStore
@@ -22,7 +22,7 @@ from fcslam.cloud.settings import FleetConfig
 from fcslam.cloud.space import Space
 from fcslam.geometry import se2
 from fcslam.graph.cluster import ClusterDecision
-from fcslam.graph.evidence import ClusterEvidence
+from fcslam.graph.evidence import AGREES_M, AGREES_RAD, ClusterEvidence
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.verification import verify
@@ -255,8 +255,8 @@ class ClosureDecisions(Kept):
             return True
         if closure.i.robot in self.map_of(closure.j.robot):
             off_m, off_rad = self._graph.innovation(closure.i, closure.j, closure.T_i_j)
-            if off_m < SURPRISE_M and off_rad < SURPRISE_RAD:
-                fits = Reason(ReasonCode.FITS_JOINT_MAP, off_m, SURPRISE_M)
+            if off_m < AGREES_M and off_rad < AGREES_RAD:
+                fits = Reason(ReasonCode.FITS_JOINT_MAP, off_m, AGREES_M)
                 self._accept(entry, fits)
                 return True
         entry.independent = True  # the joint map did not predict this closure
@@ -310,7 +310,7 @@ class ClosureDecisions(Kept):
             return decision.contested
         members = [entries[k].closure for k in decision.members]
         off_m = [self._graph.innovation(closure.i, closure.j, closure.T_i_j)[0] for closure in members]
-        return 2 * sum(off > SURPRISE_M for off in off_m) > len(off_m)
+        return 2 * sum(off > AGREES_M for off in off_m) > len(off_m)
 
 
 def _separated(before: Sequence[Sequence[str]], after: Sequence[Sequence[str]]) -> list[tuple[list[str], list[str]]]:

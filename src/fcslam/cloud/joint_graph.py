@@ -14,8 +14,6 @@ from fcslam.graph.trajectory import Trajectory, build_trajectory
 from fcslam.records import Constraint, FloatArray, KeyscanId
 from fcslam.storage.state_file import State
 
-SURPRISE_M, SURPRISE_RAD = 0.5, 0.1
-"""A closure that differs from the joint map by so much needs a cluster of closures."""
 AGREES_SIGMAS = 3.0
 """What is within so many standard deviations of a measurement agrees with it."""
 SOLVED_SHARE = 0.05

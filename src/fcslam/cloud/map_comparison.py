@@ -6,14 +6,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from fcslam.cloud.joint_graph import SURPRISE_M, SURPRISE_RAD
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.space import Space
 from fcslam.geometry import se2
 from fcslam.geometry.groups import SE2, group_of
 from fcslam.graph.cluster import local_frames, relative_frame
 from fcslam.graph.consistency import Closures
-from fcslam.graph.evidence import LARGEST_CONTRADICTION, LEAD, MapFit, refutation
+from fcslam.graph.evidence import AGREES_M, AGREES_RAD, LARGEST_CONTRADICTION, LEAD, MapFit, refutation
 from fcslam.graph.trajectory import Trajectory
 from fcslam.lidar.map_agreement import PlaceAgreement
 from fcslam.places.local_maps import LocalMaps, SeenKeyscans
@@ -150,7 +149,7 @@ class MapComparison(Kept):
 
     def _local_maps(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> LocalMaps:
         a, b = (SeenKeyscans(self._sessions.keyscans(name), self._sessions.lasers(name)) for name in sessions)
-        return LocalMaps((a, b), (poses_a, poses_b), (SURPRISE_M, SURPRISE_RAD))
+        return LocalMaps((a, b), (poses_a, poses_b), (AGREES_M, AGREES_RAD))
 
 
 def _fit(agreement: PlaceAgreement) -> MapFit:

@@ -20,6 +20,8 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.records import Reason, ReasonCode
 
+AGREES_M, AGREES_RAD = 0.5, 0.1
+"""Two transforms of one place or map that differ by no more, metres and radians, say the same; drift is in between."""
 DISTINCT_M, DISTINCT_RAD = 1.0, 0.26
 """Two transforms of one place or map that differ by more, metres or radians, are two."""
 LEAST_COMPARED_M = 5.0

@@ -15,17 +15,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.lidar.frontend import POINT_INFORMATION_SHARE, MappedKeyscan
+from fcslam.graph.evidence import AGREES_M, AGREES_RAD
+from fcslam.lidar.frontend import POINT_INFORMATION_SHARE, SUBMAP_REACH_M, MappedKeyscan
 from fcslam.lidar.lost import LEAST_OVERLAP, LEAST_RATIO, LEAST_RIVAL_M, LOST_EXPLAINED
 from fcslam.lidar.matching import match_scan
 from fcslam.lidar.submap import Submap, agreement, build_submap
 from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, SUPPORTED
+from fcslam.lidar.verification import LOOSE
 from fcslam.records import FloatArray, frozen
 from fcslam.robot.backend import BackendInput, NewKeyscan, Task
 from fcslam.wire.messages import Body
 
-AGREES_M, AGREES_RAD = 0.5, 0.1
-"""Alignments of two stretches this near each other are one; in between the robot's own motion may drift."""
 FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.05, 0.01
 """Standard deviations of a pose that the exhaustive search found."""
 FIRST_SEARCH_M = 3.0
@@ -37,7 +37,7 @@ LONGEST_STRETCH_M = 15.0
 LEAST_EVIDENCE = 3.0
 """Evidence that fixes the pose, if one of the stretches is clear: the number of separate stretches whose best
 alignments agree, plus the least of their ratios, less one."""
-MOST_IN_FREE_SPACE = 0.10
+MOST_IN_FREE_SPACE = LOOSE.violation
 """Largest share of the walls in free space of the map, or the reverse. The lead of an alignment counts less in
 proportion to the walls of the robot there."""
 CLEAR_VIOLATION = 0.045
@@ -45,7 +45,7 @@ CLEAR_VIOLATION = 0.045
 such rooms, more of each are."""
 CHECK_EVERY_M = 2.0
 """Travel between two comparisons with the map, metres."""
-CHECKED_M = 5.0
+CHECKED_M = SUBMAP_REACH_M
 """Travel, in metres, whose walls are compared with the map."""
 DOUBTED = 0.80
 """With a smaller share of the walls in the map, the pose is compared with the best one elsewhere."""

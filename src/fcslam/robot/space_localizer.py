@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from fcslam.geometry import se2, se3
 from fcslam.geometry.groups import SE3
+from fcslam.graph.evidence import AGREES_M, AGREES_RAD
 from fcslam.lidar.frontend import MappedKeyscan
 from fcslam.lidar.scan import keyscan_points
 from fcslam.lidar3d.ground import floor_at, levelled
@@ -23,7 +24,7 @@ from fcslam.lidar3d.tracker import MOST_POINTS, fit_rigid, thinned
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, frozen
 from fcslam.robot.backend import NewKeyscan, Task
 from fcslam.robot.frontend3d import RobotFrontend3d
-from fcslam.robot.map_localizer import AGREES_M, AGREES_RAD, MapEstimate, MapLocalizer
+from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
 from fcslam.sources.clouds_in_space import BAND_LASER
 from fcslam.wire.messages import Hello, Packet
 
