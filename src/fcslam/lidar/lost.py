@@ -21,7 +21,7 @@ from pydantic import Field
 from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.lidar.closing import CONCLUSIVE_OVERLAP
-from fcslam.lidar.evidence import CORRELATED, LEAST_KNOWN
+from fcslam.lidar.evidence import CLEAR, CORRELATED, LEAST_KNOWN
 from fcslam.lidar.field import SurfelField
 from fcslam.lidar.first_motion import LONGEST_GAP_S
 from fcslam.lidar.frontend import LidarFrontend
@@ -72,7 +72,7 @@ class LostConfig(Settings):
     """When a robot is lost and starts a new session."""
 
     doubted: float = Field(
-        default=0.8,
+        default=CLEAR,
         ge=0,
         le=1,
         description="a scan is doubtful if a smaller share of its points in known area lies on a surface; "

@@ -16,6 +16,7 @@ import numpy as np
 
 from fcslam.geometry import se2
 from fcslam.graph.evidence import AGREES_M, AGREES_RAD
+from fcslam.lidar.evidence import CLEAR
 from fcslam.lidar.frontend import POINT_INFORMATION_SHARE, SUBMAP_REACH_M, MappedKeyscan
 from fcslam.lidar.lost import LEAST_OVERLAP, LEAST_RATIO, LEAST_RIVAL_M, LOST_EXPLAINED
 from fcslam.lidar.matching import match_scan
@@ -47,7 +48,7 @@ CHECK_EVERY_M = 2.0
 """Travel between two comparisons with the map, metres."""
 CHECKED_M = SUBMAP_REACH_M
 """Travel, in metres, whose walls are compared with the map."""
-DOUBTED = 0.80
+DOUBTED = CLEAR
 """With a smaller share of the walls in the map, the pose is compared with the best one elsewhere."""
 LOST_IN_FREE_SPACE = 2.0 * MOST_IN_FREE_SPACE
 """A robot that is lost sees a larger share of its walls in free space of the map. It is less than that of keyscans
