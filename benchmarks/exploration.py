@@ -22,7 +22,6 @@ from fcslam.lab.simulation.floorplan import draw_floor_plan
 from fcslam.lab.simulation.options import Building
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.frontiers import (
-    NEIGHBOURS,
     REACHED_M,
     Explorer,
     frontiers,
@@ -174,14 +173,14 @@ def _passable(walls):
 
 
 def _reachable(walls, start):
-    parts, _ = label(_passable(walls), NEIGHBOURS)
+    parts, _ = label(_passable(walls), np.ones((3, 3)))
     column, row = (int(edge / SIDE_M) for edge in start)
     return parts == parts[row, column]
 
 
 def _starts(walls, count, seed):
     """Places side by side, 0.7 m apart, in the largest part of the building, shape (count, 2)."""
-    parts, _ = label(_passable(walls), NEIGHBOURS)
+    parts, _ = label(_passable(walls), np.ones((3, 3)))
     cells = np.argwhere(parts == 1 + np.argmax(np.bincount(parts.ravel())[1:]))
     first = cells[np.random.default_rng(seed).integers(len(cells))]
     taken = []
