@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -65,11 +64,6 @@ class SavedMission:
         for stored in self.stored:
             sent[stored.robot].append(SizedPacket(decode(stored.data), stored.data))
         return {robot: tuple(sorted(its, key=lambda sized: sized.packet.order)) for robot, its in sent.items()}
-
-    @property
-    def in_order(self) -> list[SizedPacket]:
-        """All packets in canonical order."""
-        return sorted(chain.from_iterable(self.packets.values()), key=lambda sized: sized.packet.order)
 
     def session_count(self, robot: str) -> int:
         """How many sessions the robot had, counted with those without a packet."""

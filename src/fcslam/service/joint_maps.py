@@ -132,7 +132,7 @@ class ServedJointMaps:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._identity: tuple[Path, tuple[int, int]] | None = None
+        self._identity: tuple[int, int] | None = None
         self._maps = JointMaps((), {}, {})
         self._histories: dict[str, TileHistory] = {}
         """By frame."""
@@ -147,11 +147,7 @@ class ServedJointMaps:
     def follow(self, path: Path) -> JointMaps:
         """The joint maps in a file as they are now; those without content before there is one."""
         with self._lock:
-            if not path.exists():
-                self._identity, self._maps = None, JointMaps((), {}, {})
-                return self._maps
-            known = path, identity(path)
-            if known != self._identity:
+            if path.exists() and (known := identity(path)) != self._identity:
                 maps = read_joint_maps(path)
                 histories = {frame: self._histories.get(frame, TileHistory()) for frame in maps.frames.values()}
                 for k, frame in maps.frames.items():

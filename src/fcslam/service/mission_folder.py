@@ -47,6 +47,10 @@ class MissionFolder:
         """The run folder of a requested result."""
         return self.path / "runs" / name
 
+    def result(self, name: str) -> Path | None:
+        """The run folder of a requested result, if it is there."""
+        return self.run(name).resolve() if self.run(name).is_dir() else None
+
     def publish(self, run: Run) -> None:
         """Make ``run`` the live one; those before it stay for a while, for readers that have them open."""
         snapshots = self.path / "snapshots"

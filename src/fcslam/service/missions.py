@@ -77,7 +77,7 @@ class OpenMission:
 
     def result(self, name: str) -> Path | None:
         """The run folder of a requested result; None if it does not exist."""
-        return existing_result(self.folder, name)
+        return self.folder.result(name)
 
     def sessions(self, robot: str | None = None) -> list[SessionState]:
         """Sessions of one robot or of all, by robot and epoch, whoever received their packets."""
@@ -106,11 +106,6 @@ class OpenMission:
         """Stop the worker, then close the store."""
         self.worker.stop()
         self.store.close()
-
-
-def existing_result(folder: MissionFolder, name: str) -> Path | None:
-    """The run folder of a requested result, if it is there."""
-    return folder.run(name).resolve() if folder.run(name).is_dir() else None
 
 
 def _check_file(folder: MissionFolder) -> None:
@@ -165,7 +160,7 @@ class Missions:
 
     def result(self, name: str, number: int) -> Path | None:
         """The run folder of a result of a mission; None if it does not exist."""
-        return existing_result(MissionFolder.of(self.root, name), str(number))
+        return MissionFolder.of(self.root, name).result(str(number))
 
     def export(self, name: str, path: Path) -> None:
         """Write a mission as one new file."""

@@ -39,7 +39,7 @@ ENTRIES = [
 
 
 def put_detector(desk, content):
-    path = desk.state.detectors.path(Channel.CAMERA, "v1")
+    path = desk.state.missions.detectors.path(Channel.CAMERA, "v1")
     path.parent.mkdir(parents=True)
     path.write_bytes(content)
 

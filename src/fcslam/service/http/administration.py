@@ -90,7 +90,7 @@ def administration_router(state: ServiceState) -> APIRouter:
     async def announce_detector(request: Request) -> DetectorSummary:
         """Add a network (ONNX) and announce it to every robot that has a camera and uses another one."""
         content = await read_body(request, MAXIMUM_NETWORK_BYTES)
-        file = await run_in_threadpool(state.detectors.announce, content)
+        file = await run_in_threadpool(state.missions.detectors.announce, content)
         return DetectorSummary(channel=file.channel, version=file.version, announced=True)
 
     return router

@@ -30,7 +30,6 @@ from fcslam.service.viewed_mission import run_of, viewed_run
 from fcslam.untrusted import read_bytes
 from fcslam.wire.fleet_replies import FleetReply, FrontierReply, MapFrontiers, QualityReply, TeammatePose
 
-BYTES = "application/octet-stream"
 Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan=False, strict=True)]
 
 
@@ -112,7 +111,7 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         state.measures.answer_map(robot, len(body))
         return Response(body, media_type=NETWORK, headers=headers)
 
-    @router.get("/robots/{robot}/points", dependencies=as_reader, **file_of(BYTES, is_tagged=True))
+    @router.get("/robots/{robot}/points", dependencies=as_reader, **file_of(NETWORK, is_tagged=True))
     def get_points(request: Request, robot: Name) -> Response:
         """The points of the map in space that a robot is in, as a PLY file that is as old as the live map."""
         folder, sessions = state.mission.run_folder, run_of(state.mission).trajectories.values()
@@ -122,10 +121,10 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         file = folder / f"{map_stem(numbers[-1])}.ply"
         if not file.exists():
             raise HTTPException(404, f"the map of robot '{robot}' has no points in space yet")
-        answer = unless_known(request, read_bytes(file, folder), BYTES)
+        answer = unless_known(request, read_bytes(file, folder), NETWORK)
         if answer.status_code == 200 and "gzip" in request.headers.get("accept-encoding", ""):
             headers = {"ETag": answer.headers["etag"], "Content-Encoding": "gzip"}
-            return Response(gzip.compress(answer.body, 6, mtime=0), media_type=BYTES, headers=headers)
+            return Response(gzip.compress(answer.body, 6, mtime=0), media_type=NETWORK, headers=headers)
         return answer
 
     @router.get("/frontiers", dependencies=as_reader)

@@ -107,10 +107,10 @@ def detector_router(state: ServiceState) -> APIRouter:
     @router.get("/detectors", tags=["fleet"], dependencies=state.require(Role.VIEWER, Role.ADMIN))
     def get_detectors() -> list[DetectorSummary]:
         """Detectors that robots may download, and whether they are announced."""
-        announced = {(str(channel), file.version) for channel, file in state.detectors.announced().items()}
+        announced = {(str(channel), file.version) for channel, file in state.missions.detectors.announced().items()}
         return [
             DetectorSummary(channel=Channel(channel), version=version, announced=(channel, version) in announced)
-            for channel, version in state.detectors.versions()
+            for channel, version in state.missions.detectors.versions()
         ]
 
     @router.get(
@@ -121,7 +121,7 @@ def detector_router(state: ServiceState) -> APIRouter:
     )
     def get_detector(channel: Channel, version: Name) -> FileResponse:
         """The network of a detector version."""
-        path = state.detectors.path(channel, version)
+        path = state.missions.detectors.path(channel, version)
         if not path.is_file():
             raise HTTPException(404, f"there is no {channel} detector '{version}'")
         return FileResponse(path, media_type=NETWORK)

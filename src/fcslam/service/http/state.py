@@ -15,7 +15,6 @@ from starlette.types import Scope
 
 from fcslam.service.audit_log import AuditLog
 from fcslam.service.authentication import Authenticator, Identity, Role
-from fcslam.service.detectors import DetectorStore
 from fcslam.service.http.limits import WHO
 from fcslam.service.http.prometheus import ServiceMetrics
 from fcslam.service.missions import Missions, OpenMission
@@ -106,11 +105,6 @@ class ServiceState:
     def mission(self) -> OpenMission:
         """The open mission."""
         return self.missions.open_mission
-
-    @property
-    def detectors(self) -> DetectorStore:
-        """Detectors that robots may download."""
-        return self.missions.detectors
 
     def require(self, *roles: Role) -> list[Dependency]:
         """Dependencies of a route: whoever asks has one of the roles, and a robot that of itself alone.

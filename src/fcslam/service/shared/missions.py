@@ -19,7 +19,7 @@ from fcslam.service.intake import AGENT_LEASE_S, Agents, Intake, held_by_another
 from fcslam.service.mission_folder import MissionFolder, keep_newest
 from fcslam.service.missions import FIRST, OpenMission, UnknownMissionError, locked, sweep
 from fcslam.service.shared.files import JOINT, LIVE, RESULT, SharedDetectors, fetch_folder, fetched
-from fcslam.service.shared.instance import Instance
+from fcslam.service.shared.instance import LOOK_S, Instance
 from fcslam.service.shared.mission_tables import Lease, MissionTables, insert_mission, schema_of
 from fcslam.service.shared.registry import KnownMission, Registry
 from fcslam.service.supervisor import Elsewhere, RunningWorker
@@ -32,9 +32,6 @@ NAMED: Final[ContextVar[str | None]] = ContextVar("named mission", default=None)
 """The mission that the present request names; None: the open one."""
 _SEEN: Final = "seen"
 """Folder of a mission's run folders that its workers, here or elsewhere, shared."""
-
-_JOINT_LOOK_S: Final = 1.0
-"""Between two looks for joint maps that a worker elsewhere shared."""
 
 
 class SharedAgents(Agents):
@@ -123,7 +120,7 @@ class SharedMission(OpenMission):
         with self._fetching:
             now_s = time.monotonic()
             if now_s > self._joint_at_s:
-                content, self._joint_at_s = fetched(self._server, self._number, JOINT), now_s + _JOINT_LOOK_S
+                content, self._joint_at_s = fetched(self._server, self._number, JOINT), now_s + LOOK_S
                 if content is not None:
                     with translate_errors(copy):
                         copy.parent.mkdir(parents=True, exist_ok=True)
@@ -179,8 +176,7 @@ class SharedMissions:
         self._opening = threading.Lock()
         self._opened: dict[str, SharedMission] = {}
         self.detectors.follow()
-        follow = self.detectors.follow
-        self._instance = Instance(self._registry, name, most_missions, launch, listen, follow)
+        self._instance = Instance(self._registry, name, most_missions, launch, listen, self.detectors.follow)
         resources.callback(self._instance.close)
         if not any(known.is_open for known in self._instance.known.values()):
             self._open_first()
