@@ -70,8 +70,25 @@ class Places(NamedTuple):
     """Covariance that a drive of one metre adds near each place, calibrated, along the axes of ``map``, (P, 3, 3)."""
 
     def bend_m(self, within_m: float, wanted: NDArray[np.int64] | None = None) -> FloatArray:
-        """Expected error of the map around each of the ``wanted`` places, all by default, shape (P,)."""
-        return bend_m(self.poses, self.covariance, within_m, wanted)
+        """Root mean square error of the positions around each place after the best rigid alignment, shape (P,).
+
+        Places that are not ``wanted`` have none; None: all are.
+        """
+        poses, result = self.poses, np.zeros(len(self.poses))
+        if len(poses) < 3:
+            return result
+        farthest = min(FEWEST_NEAR, len(poses)) - 1
+        for k in range(len(poses)) if wanted is None else wanted.tolist():
+            apart_m = _distances(poses, poses[k])
+            near = np.flatnonzero(apart_m <= max(within_m, float(np.partition(apart_m, farthest)[farthest])))
+            arms = poses[near, :2] - poses[near, :2].mean(axis=0)
+            motions = np.concatenate((np.tile(np.eye(2), (len(near), 1)), (arms @ _S.T).reshape(-1, 1)), axis=1)
+            motions /= np.maximum(np.linalg.norm(motions, axis=0), 1e-9)
+            rows = (3 * near[:, None] + (0, 1)).ravel()
+            around = self.covariance[np.ix_(rows, rows)]
+            rigid = (motions * (around @ motions)).sum()
+            result[k] = math.sqrt(max(0.0, float(np.trace(around) - rigid)) / len(near))
+        return result
 
 
 def certify(
@@ -157,30 +174,6 @@ def _contradiction(graph: PoseGraph, rows: NDArray[np.int64], variables: int) ->
     return math.sqrt(float(graph.chi2(rows=inside).sum()) / (3.0 * redundant)) if redundant > 0 else 0.0
 
 
-def bend_m(
-    poses: FloatArray, covariance: FloatArray, within_m: float, wanted: NDArray[np.int64] | None = None
-) -> FloatArray:
-    """Root mean square error of the positions around each place after the best rigid alignment, shape (P,), metres.
-
-    Places that are not ``wanted`` have none.
-    """
-    result = np.zeros(len(poses))
-    if len(poses) < 3:
-        return result
-    farthest = min(FEWEST_NEAR, len(poses)) - 1
-    for k in range(len(poses)) if wanted is None else wanted.tolist():
-        apart_m = _distances(poses, poses[k])
-        near = np.flatnonzero(apart_m <= max(within_m, float(np.partition(apart_m, farthest)[farthest])))
-        arms = poses[near, :2] - poses[near, :2].mean(axis=0)
-        motions = np.concatenate((np.tile(np.eye(2), (len(near), 1)), (arms @ _S.T).reshape(-1, 1)), axis=1)
-        motions /= np.maximum(np.linalg.norm(motions, axis=0), 1e-9)
-        rows = (3 * near[:, None] + (0, 1)).ravel()
-        around = covariance[np.ix_(rows, rows)]
-        rigid = (motions * (around @ motions)).sum()
-        result[k] = math.sqrt(max(0.0, float(np.trace(around) - rigid)) / len(near))
-    return result
-
-
 def _part(graph: PoseGraph, poses: FloatArray, rows: NDArray[np.int64]) -> PoseGraph:
     """One map. What no edge connects with the first keyscan is held by it weakly, so that it counts as unknown."""
     edges = graph.arrays()
@@ -232,7 +225,7 @@ def _drives(
         a = int(known[np.argmin(np.where(known == b, np.inf, apart))])
         if a == b:
             continue
-        after = bend_m(places.poses, _with_motion(places, a, b), within_m, bad)
+        after = places._replace(covariance=_with_motion(places, a, b)).bend_m(within_m, bad)
         gain = int(weight[bad[QUANTILE * after[bad] <= bar_m]].sum())
         if gain >= LEAST_GAIN_M2:
             ends = [[round(float(value), 1) for value in places.poses[k, :2]] for k in (a, b)]

@@ -63,7 +63,8 @@ def frontiers(
         return []
     passable = passable_cells(free, occupied, side_m, radius_m)
     unknown = cv2.morphologyEx((~free & ~occupied).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    _, parts, boxes, _ = cv2.connectedComponentsWithStats((free & _beside(unknown > 0)).astype(np.uint8))
+    beside = cv2.dilate(unknown, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)))
+    _, parts, boxes, _ = cv2.connectedComponentsWithStats(free & beside)
     window = max(1, round(VIEW_M / side_m))
     share = cv2.blur(unknown.astype(np.float32), (window, window), borderType=cv2.BORDER_REPLICATE)
     gains_m2 = (window * side_m) ** 2 * share
@@ -150,15 +151,6 @@ def search_grid(occupancy: OccupancyMap) -> tuple[Cells, Cells, float, tuple[flo
     y, x = (float(start) * occupancy.resolution_m for start in low - edge)
     side_m = wide * occupancy.resolution_m
     return free, occupied, side_m, (occupancy.origin_xy[0] + x, occupancy.origin_xy[1] + y)
-
-
-def _beside(cells: Cells) -> Cells:
-    near = np.zeros_like(cells)
-    near[1:] |= cells[:-1]
-    near[:-1] |= cells[1:]
-    near[:, 1:] |= cells[:, :-1]
-    near[:, :-1] |= cells[:, 1:]
-    return near
 
 
 def passable_cells(free: Cells, occupied: Cells, side_m: float, radius_m: float) -> Cells:
