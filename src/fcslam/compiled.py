@@ -45,7 +45,7 @@ def njit(function: Any = None, *, nogil: bool = False, allocates: bool = True) -
     """
     if function is None:
         return lambda function: njit(function, nogil=nogil, allocates=allocates)
-    dispatcher = numba.njit(nogil=nogil, _nrt=allocates, forceinline=not allocates)(function)
+    dispatcher = numba.njit(nogil=nogil, error_model="numpy", _nrt=allocates, forceinline=not allocates)(function)
     try:
         dispatcher._cache = _Cache(function)
     except RuntimeError:  # no locator available: no folder can be written
@@ -135,3 +135,10 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         with (folder / "numba.lock").open("a") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             yield
+
+
+@njit(allocates=False)
+def assign(target: Any, source: Any) -> None:
+    """``target[:] = source`` in compiled code; numba compiles that for two seconds, for the message of an error."""
+    for k in range(len(target)):
+        target[k] = source[k]

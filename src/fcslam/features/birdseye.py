@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.compiled import njit
+from fcslam.compiled import assign, njit
 from fcslam.features.codes import CODE_BITS
 from fcslam.records import CODE_BYTES, Codes, FloatArray, frozen
 
@@ -157,7 +157,7 @@ def _compare(
     rows, columns = picture.shape
     outside = rows * columns
     levels = np.zeros(outside + 1, np.uint8)  # the last one is that of the points outside
-    levels[:outside] = picture.ravel()
+    assign(levels[:outside], picture.ravel())
     cells = np.empty((2, pattern.shape[1]), np.int32)
     darker = np.empty((pixels.shape[0], pattern.shape[1]), np.bool_)
     for index in range(pixels.shape[0]):

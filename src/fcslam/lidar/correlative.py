@@ -239,7 +239,7 @@ def _branch_and_bound(  # type: ignore[no-untyped-def]
         near = ((start[0] - guess[0]) ** 2 + (start[1] - guess[1]) ** 2) / (cell * cell)
         turned = abs((start[2] - guess[2] + np.pi) % (2.0 * np.pi) - np.pi) / step
         best = best_raw * _penalty(near, shifts, turned, turns, distance_penalty, angle_penalty)
-        best_pose[:] = start
+        best_pose = start.copy()
     stack = np.empty((4 * (top + 2), 3), np.int64)
     # Small turns first: an early good score prunes most of the rest.
     for order in range(2 * turns + 1):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.compiled import njit
+from fcslam.compiled import assign, njit
 from fcslam.features.codes import CODE_BITS, CODE_WORDS, CodeWords, popcount
 from fcslam.places.prefetch import prefetch
 
@@ -80,7 +80,7 @@ def near_leaves(tree: Tree, codes: CodeWords, beam: int) -> NDArray[np.int32]:
     return kept
 
 
-@njit
+@njit(allocates=False)
 def _prefetch_children(tree: Tree, kept: NDArray[np.int32]) -> int:
     """Prefetch the centres of the children of these vertices (-1: none); returns how many vertices have children."""
     parents = 0
@@ -94,7 +94,7 @@ def _prefetch_children(tree: Tree, kept: NDArray[np.int32]) -> int:
     return parents
 
 
-@njit
+@njit(allocates=False)
 def _go_down(
     tree: Tree,
     codes: CodeWords,
@@ -135,7 +135,7 @@ def grow_tree(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
     centres = np.zeros((most, CODE_WORDS), np.uint64)
     families = np.zeros((most, 2), np.int32)
     begin, end, level = np.zeros(most, np.int64), np.zeros(most, np.int64), np.zeros(most, np.int64)
-    members = np.arange(codes.shape[0])
+    members, sorted_members = np.arange(codes.shape[0]), np.empty(codes.shape[0], np.int64)
     end[0], used, vertex = codes.shape[0], 1, 0
     state = np.array([seed], np.uint64)
     while vertex < used:
@@ -144,12 +144,17 @@ def grow_tree(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
             found, labels = k_means(codes[members[low:high]], shape, state)
             if found.shape[0] > 1:
                 families[vertex, 0], families[vertex, 1] = used, found.shape[0]
-                members[low:high] = members[low:high][np.argsort(labels, kind="mergesort")]
-                bounds = low + np.cumsum(np.bincount(labels, minlength=found.shape[0]))
-                children = slice(used, used + found.shape[0])
-                centres[children], level[children], end[children] = found, level[vertex] + 1, bounds
-                begin[used], begin[used + 1 : used + found.shape[0]] = low, bounds[:-1]
-                used += found.shape[0]
+                bound = low
+                for label in range(found.shape[0]):
+                    begin[used], level[used] = bound, level[vertex] + 1
+                    for k in range(low, high):
+                        if labels[k - low] == label:
+                            sorted_members[bound] = members[k]
+                            bound += 1
+                    end[used] = bound
+                    assign(centres[used], found[label])
+                    used += 1
+                assign(members[low:high], sorted_members[low:high])
         vertex += 1
     return Tree(centres[:used].copy(), families[:used].copy())
 
@@ -173,7 +178,7 @@ def k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tu
     return centres[sizes > 0], (np.cumsum(sizes > 0) - 1)[labels]
 
 
-@njit
+@njit(allocates=False)
 def _distance(codes: CodeWords, k: int, centres: CodeWords, vertex: int) -> Any:
     """Hamming distance of code k and a centre. Takes indices, because slicing rows costs more than comparing them."""
     bits = popcount(codes[k, 0] ^ centres[vertex, 0]) + popcount(codes[k, 1] ^ centres[vertex, 1])
@@ -181,7 +186,7 @@ def _distance(codes: CodeWords, k: int, centres: CodeWords, vertex: int) -> Any:
     return np.int32(bits)
 
 
-@njit
+@njit(allocates=False)
 def _nearest(codes: CodeWords, k: int, centres: CodeWords, first: int, end: int) -> Any:
     """Index of the centre nearest to code k, from ``first`` (included) to ``end`` (excluded)."""
     best, best_distance = first, np.int32(CODE_BITS + 1)
@@ -192,7 +197,7 @@ def _nearest(codes: CodeWords, k: int, centres: CodeWords, first: int, end: int)
     return best
 
 
-@njit
+@njit(allocates=False)
 def _assign(codes: CodeWords, centres: CodeWords, labels: NDArray[np.int64]) -> int:
     changed = 0
     for k in range(codes.shape[0]):
@@ -206,7 +211,7 @@ def _assign(codes: CodeWords, centres: CodeWords, labels: NDArray[np.int64]) -> 
 def _seed_centres(codes: CodeWords, branching: int, state: NDArray[np.uint64]) -> CodeWords:
     """k-means++ (Arthur and Vassilvitskii 2007): draw each next centre by its squared distance to those so far."""
     centres = np.empty((branching, CODE_WORDS), np.uint64)
-    centres[0] = codes[int(_uniform(state) * codes.shape[0])]
+    assign(centres[0], codes[int(_uniform(state) * codes.shape[0])])
     nearest = np.full(codes.shape[0], CODE_BITS + 1, np.int64)
     count = 1
     while count < branching:
@@ -215,7 +220,8 @@ def _seed_centres(codes: CodeWords, branching: int, state: NDArray[np.uint64]) -
         reach = np.cumsum(nearest * nearest)
         if reach[-1] == 0:
             break
-        centres[count] = codes[np.searchsorted(reach, int(_uniform(state) * reach[-1]), side="right")]
+        drawn = np.searchsorted(reach, int(_uniform(state) * reach[-1]), side="right")
+        assign(centres[count], codes[drawn])
         count += 1
     return centres[:count]
 
@@ -250,7 +256,7 @@ def _majorities(codes: CodeWords, labels: NDArray[np.int64], count: int) -> Code
     return centres
 
 
-@njit
+@njit(allocates=False)
 def _uniform(state: NDArray[np.uint64]) -> float:
     """Next number in [0, 1) of splitmix64 (Steele, Lea, Flood 2014), so that the tree depends on the seed alone."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)

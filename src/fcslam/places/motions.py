@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.compiled import njit
+from fcslam.compiled import assign, njit
 from fcslam.features.codes import LARGEST_HAMMING, Matches, mutual_matches
 from fcslam.geometry import se2
 from fcslam.graph.evidence import DISTINCT_M, DISTINCT_RAD
@@ -125,7 +125,7 @@ def _best(a: FloatArray, b: FloatArray, seeds: NDArray[np.int64]) -> tuple[Float
         if count < MINIMUM_INLIERS or _near(pose, poses[:found]):
             continue
         poses[found, 0], poses[found, 1], poses[found, 2] = pose
-        agreeing[found] = agrees
+        assign(agreeing[found], agrees)
         found += 1
         for index in range(scores.shape[0]):
             if scores[index] > 0.0 and _near(_pose(trials, index), poses[found - 1 : found]):

@@ -205,13 +205,13 @@ def _heads(vertices: int) -> NDArray[np.int32]:
     return np.tile(np.array([-1, 0], np.int32), (vertices, 1))
 
 
-@njit
+@njit(allocates=False)
 def newest_block(entries: Entries, leaf: int) -> tuple[int, int]:
     """The newest block of a leaf, -1 for none, and the number of its entries."""
     return entries.heads[leaf, 0], (entries.heads[leaf, 1] - 1) % BLOCK + 1
 
 
-@njit
+@njit(allocates=False)
 def prefetch_block(entries: Entries, block: int) -> None:
     """Prefetch the part of a block that a query reads; blocks are not aligned to cache lines."""
     for number in range(0, OLDER, 16):  # numbers in a cache line
@@ -258,7 +258,7 @@ def _fill(entries: Entries, places: int, codes: CodeWords, first: NDArray[np.int
             entries.log_documents[row] = log_documents[entries.leaves[begin : begin + entries.counts[row]]].sum()
 
 
-@njit
+@njit(allocates=False)
 def _put(entries: Entries, block: int, place: int, row: int, index: int, codes: CodeWords, k: int) -> None:
     """Write an entry: descriptor ``index`` of a row, with code k of ``codes``."""
     entries.numbers[block, ROWS + place], entries.numbers[block, _INDICES + place] = row, index
@@ -266,7 +266,7 @@ def _put(entries: Entries, block: int, place: int, row: int, index: int, codes: 
         entries.blocks[block, CODE_WORDS * place + word] = codes[k, word]
 
 
-@njit
+@njit(allocates=False)
 def _append(entries: Entries, leaf: int, row: int, index: int, codes: CodeWords, k: int) -> Any:
     """Append an entry; returns whether it is the first of its place in the leaf. A place's entries come in a row."""
     block, filled = newest_block(entries, leaf)
@@ -287,7 +287,7 @@ def _append(entries: Entries, leaf: int, row: int, index: int, codes: CodeWords,
     return is_new
 
 
-@njit
+@njit(allocates=False)
 def _shift(entries: Entries, leaf: int, change: float, but: int) -> None:
     """Add ``change`` to ``log_documents`` for every descriptor in a leaf, except those of row ``but``."""
     if not len(entries.log_documents):
@@ -300,7 +300,7 @@ def _shift(entries: Entries, leaf: int, change: float, but: int) -> None:
         block, filled = entries.numbers[block, OLDER], BLOCK
 
 
-@njit
+@njit(allocates=False)
 def _remove(entries: Entries, leaves: NDArray[np.int32], row: int) -> None:
     """Remove the entries of a row, from the end, so that the last entry, which fills each gap, is one that stays."""
     for leaf in leaves:
@@ -317,7 +317,7 @@ def _remove(entries: Entries, leaves: NDArray[np.int32], row: int) -> None:
             _shift(entries, leaf, np.log(left / (left + 1)), -1)
 
 
-@njit
+@njit(allocates=False)
 def _drop(entries: Entries, leaf: int, block: int, place: int) -> None:
     last, filled = newest_block(entries, leaf)
     row, index = entries.numbers[last, ROWS + filled - 1], entries.numbers[last, _INDICES + filled - 1]
@@ -330,7 +330,7 @@ def _drop(entries: Entries, leaf: int, block: int, place: int) -> None:
         entries.free[0] = last
 
 
-@njit
+@njit(allocates=False)
 def _read(entries: Entries, leaves: NDArray[np.int32], content: Content) -> None:
     count = 0
     for leaf in leaves:
@@ -345,7 +345,7 @@ def _read(entries: Entries, leaves: NDArray[np.int32], content: Content) -> None
             block, filled = entries.numbers[block, OLDER], BLOCK
 
 
-@njit
+@njit(allocates=False)
 def _move(
     entries: Entries,
     leaves: NDArray[np.int32],
@@ -363,7 +363,7 @@ def _move(
         _shift(entries, leaf, np.log(entries.documents[leaf]), -1)
 
 
-@njit
+@njit(allocates=False)
 def _gather(entries: Entries, leaves: NDArray[np.int64], begins: NDArray[np.int64], codes: CodeWords) -> None:
     for leaf in leaves:
         block, filled = newest_block(entries, leaf)
@@ -377,7 +377,7 @@ def _gather(entries: Entries, leaves: NDArray[np.int64], begins: NDArray[np.int6
             block, filled = entries.numbers[block, OLDER], BLOCK
 
 
-@njit
+@njit(allocates=False)
 def _clear(entries: Entries, leaf: int) -> None:
     block = entries.heads[leaf, 0]
     while block >= 0:

@@ -156,7 +156,7 @@ def _taken(buffers: ScoreBuffers, total: int) -> tuple[NDArray[np.int32], FloatA
     return rows, scores
 
 
-@njit
+@njit(allocates=False)
 def _distance(codes: CodeWords, k: int, blocks: NDArray[np.uint64], block: int, place: int) -> Any:
     """Hamming distance of code k and the code of an entry."""
     bits = popcount(codes[k, 0] ^ blocks[block, 4 * place]) + popcount(codes[k, 1] ^ blocks[block, 4 * place + 1])
