@@ -84,7 +84,7 @@ def fly(sources: list[Source]) -> tuple[Ledger, list[Packet]]:
     for packet in heapq.merge(*streams, key=lambda packet: packet.order):
         sent = measure(packet)
         for sized in (sent, *map(measure, cloud.apply(sent.packet))):
-            traffic.accept(sized.label, sized.size)
+            traffic.accept(sized.label, len(sized.data))
         if isinstance(packet.body, Place):
             places.append(packet)
     return traffic, places

@@ -140,7 +140,7 @@ def map_building(driven: list[Driven], config: MissionConfig) -> Spent:
     hours = sum(robot.hours for robot in driven)
     run = cloud.run(tracks, sum(robot.scans for robot in driven), 3600.0 * hours)
     ended = time.process_time()
-    sent = sum(sized.size for robot in driven for sized in robot.packets)
+    sent = sum(len(sized.data) for robot in driven for sized in robot.packets)
     area_m2 = sum(np.isin(grid.cells, KNOWN).sum() * grid.resolution_m**2 for grid in run.maps.values())
     robot_s = sum(robot.cpu_s for robot in driven)
     return Spent(

@@ -111,7 +111,7 @@ def rows_of(bags: Path, seed: int, pair: list[str], is_one: bool) -> list[tuple[
             assert robot.space is not None
             found.append(track.on_keyscans(robot.space.T_map_base))
             true.append(poses[np.abs(stamps[:, None] - track.stamps).argmin(axis=0)])
-        uplink.append(sum(sent.size for sent in driven.packets) / 1e3 / float(np.ptp(stamps)))
+        uplink.append(sum(len(sent.data) for sent in driven.packets) / 1e3 / float(np.ptp(stamps)))
     errors = errors_of(np.concatenate(found), np.concatenate(true)) if maps == 1 else 4 * (float("nan"),)
     return [(seed, maps, closures, *errors, max(uplink))]
 

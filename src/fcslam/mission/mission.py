@@ -157,7 +157,7 @@ class MissionCloud:
         self._packets.append(as_stored(sent))
         news = (reply for reply in replies if not isinstance(reply.body, Acknowledgement))
         for packet in (sent, *map(measure, news)):
-            self._traffic.accept(packet.label, packet.size)
+            self._traffic.accept(packet.label, len(packet.data))
         return replies
 
     def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:

@@ -50,11 +50,6 @@ class SizedPacket(NamedTuple):
     data: bytes
 
     @property
-    def size(self) -> int:
-        """Bytes."""
-        return len(self.data)
-
-    @property
     def label(self) -> Label:
         """By which its traffic is counted."""
         body = self.packet.body
