@@ -191,7 +191,7 @@ def test_edits_and_requests_are_kept_in_their_order(store):
 
 
 @pytest.mark.parametrize(
-    ("number", "told"), [(1, "before, by edit 2"), (2, "again"), (4, "there are 3")], ids=["twice", "an undo", "none"]
+    ("number", "told"), [(1, "before, by edit 2"), (2, "again"), (4, "shows all 3")], ids=["twice", "an undo", "none"]
 )
 def test_what_cannot_be_undone_changes_nothing(store, number, told):
     for content in (Veto("a", "b"), Undo(1), Removal("a")):
