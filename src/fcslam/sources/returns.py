@@ -99,7 +99,7 @@ class RangeSample:
             if is_apart(places[-1].T_odom_base, sample.T_odom_base):
                 places.append(sample)
         beams = sum(len(sample.values) for sample in places)
-        if len(places) < FEWEST:
+        if len(places) <= FEWEST:
             return ()
         values, counts = np.unique(np.concatenate([_returns(place) for place in places]), return_counts=True)
         found = []
