@@ -33,3 +33,8 @@ def test_consecutive_places_are_one_visit():
     poses = np.array([(0, 0, 0), (1, 0, 0), (20, 0, 0), (2, 0, 0), (0.5, 0, 0), (30, 0, 0)], float)
     found = visits_near("a", np.arange(6), poses, np.zeros(2), 5.0)
     assert [each.nearest.number for each in found] == [0, 4]
+
+
+def test_a_place_above_another_is_not_near():
+    poses = np.array([(0, 0, 0, 0, 0, 0, 1), (1, 0, 3.2, 0, 0, 0, 1)], float)
+    assert [each.nearest.number for each in visits_near("a", np.arange(2), poses, np.zeros(3), 3.0)] == [0]

@@ -92,7 +92,6 @@ def test_the_cluster_is_the_true_closures(seed: int) -> None:
     assert len(members & set(range(20))) >= 16
     assert len(members - set(range(20))) <= 1
     assert verdict.dominant
-    assert verdict.exact
     assert len(verdict.members) > 4 * len(verdict.runner_up)
 
 

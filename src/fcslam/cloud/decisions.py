@@ -188,7 +188,7 @@ class ClosureDecisions(Kept):
         """The evidence of a join with the fit of both maps, which was not needed if other joins decided."""
         if evidence.fit is not None:
             return evidence
-        a, b = sorted(pair)
+        a, b = sorted(pair, key=self._sessions.robots.index)
         return replace(evidence, fit=self.comparison.at((a, b), fusion.T_map_base[a], fusion.T_map_base[b]))
 
     def _mark(self, entry: ClosureEntry) -> bool:

@@ -114,9 +114,11 @@ def reevaluate(
     T_map_base: dict[str, FloatArray] = {robot: frozen(graph.trajectory(robot)) for robot in robots}
     T_local_base = dict(zip(robots, solution.own, strict=True))
     joins = {frozenset((robots[link.a], robots[link.b])): link.decision.evidence for link in solution.joining}
-    for pair in {frozenset((e.closure.i.robot, e.closure.j.robot)) for e in entries if e.is_certain and e.is_between}:
+    certain = [frozenset((e.closure.i.robot, e.closure.j.robot)) for e in entries if e.is_certain and e.is_between]
+    for pair in dict.fromkeys(certain):
         held = [entry.closure for entry in entries if {entry.closure.i.robot, entry.closure.j.robot} == pair]
-        count, (a, b) = sum(closure.status is ClosureStatus.ACCEPTED for closure in held), sorted(pair)
+        count = sum(closure.status is ClosureStatus.ACCEPTED for closure in held)
+        a, b = sorted(pair, key=robots.index)
         joins[pair] = ClusterEvidence(count, count, 1, fit=compare((a, b), T_map_base[a], T_map_base[b]))
     return Fusion(members, T_map_base, T_local_base, tuple(entry.closure for entry in closures), joins)
 

@@ -47,8 +47,10 @@ def T_placed_map(
     if not placements:
         return level
     last = placements[-1]
-    T_map_keyscan = group.to_plane(pose_of(sessions.nearest(last.session, last.stamp)))
-    T = group.from_plane(se2.compose(np.array(last.pose), se2.inverse(T_map_keyscan)))
+    T_map_keyscan = pose_of(sessions.nearest(last.session, last.stamp))
+    if level is not None:
+        T_map_keyscan = group.compose(level, T_map_keyscan)
+    T = group.from_plane(se2.compose(np.array(last.pose), se2.inverse(group.to_plane(T_map_keyscan))))
     return T if level is None else group.compose(T, level)
 
 

@@ -188,7 +188,7 @@ class PlaceRecognition:
             if session == place.id.robot or not len(numbers):
                 continue
             poses = self._graph.trajectory(session, numbers)
-            found = visits_near(session, numbers, poses, pose[:2], SIGHT_M)
+            found = visits_near(session, numbers, poses, pose[: self._graph.group.axes], SIGHT_M)
             if found:
                 visits.setdefault(robot_of(session), []).extend(found)
         chosen = worth_comparing(visits.values(), NEAR_VISITS, COMPARED_VISITS)
@@ -228,14 +228,14 @@ class PlaceRecognition:
 
 
 def visits_near(
-    session: str, numbers: NDArray[np.int64], T_map_place: FloatArray, xy: FloatArray, within_m: float
+    session: str, numbers: NDArray[np.int64], T_map_place: FloatArray, point: FloatArray, within_m: float
 ) -> list[Visit]:
-    """The visits of a session to the surroundings of a point (2,), in their order.
+    """The visits of a session to the surroundings of a point (A,), in the plane or in space, in their order.
 
-    ``numbers``: of the keyscans of its places (N,), in their order, at the poses (N, 3). Consecutive ones that are near
+    ``numbers``: of the keyscans of its places (N,), in their order, at the poses (N, P). Consecutive ones that are near
     are one visit.
     """
-    distance = np.hypot(T_map_place[:, 0] - xy[0], T_map_place[:, 1] - xy[1])
+    distance = np.linalg.norm(T_map_place[:, : len(point)] - point, axis=1)
     close = np.flatnonzero(distance < within_m)
     stays = np.split(close, np.flatnonzero(np.diff(close) > 1) + 1) if len(close) else []
     visits = []

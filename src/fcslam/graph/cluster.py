@@ -64,8 +64,6 @@ class ClusterDecision:
     runner_up: tuple[int, ...]
     """Largest cluster that contradicts it: its closures are inconsistent with at least half of the members."""
     evidence: ClusterEvidence
-    exact: bool
-    """Whether both clusters are proven to be the largest."""
     contested: bool
     """Whether the runner-up would be enough to join two maps as well and the cluster is not clearly larger, or the maps
     refute the largest cluster."""
@@ -231,11 +229,11 @@ def dominant_cluster(
 
     remaining, refuted = np.arange(len(consistent)), list[ClusterDecision]()
     for _ in range(MOST_CLUSTERS):
-        largest, is_largest = maximum_clique(consistent[np.ix_(remaining, remaining)])
+        largest, _ = maximum_clique(consistent[np.ix_(remaining, remaining)])
         members = remaining[largest]
         others = np.flatnonzero(2 * consistent[:, members].sum(axis=1) <= len(members))
         others = np.setdiff1d(others, members)
-        second, is_second = maximum_clique(consistent[np.ix_(others, others)])
+        second, _ = maximum_clique(consistent[np.ix_(others, others)])
         runner_up = others[second]
         evidence, reason = decide(members, runner_up)
         is_refuted = reason is not None and reason.code in _MAPS_REFUTE
@@ -244,7 +242,6 @@ def dominant_cluster(
             members=tuple(members.tolist()),
             runner_up=tuple(runner_up.tolist()),
             evidence=evidence,
-            exact=is_largest and is_second,
             contested=is_refuted or (has_no_lead and evidence.rival_places >= settings.minimum_evidence),
             shortfall=reason,
         )

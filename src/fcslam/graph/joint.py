@@ -268,9 +268,8 @@ def _merge_frames(
         members = link.closures.select(np.array(link.decision.members, dtype=np.int64))
         T_map_i = group.compose(frames[link.a], own[link.a].poses[members.i])
         T_map_j = group.compose(frames[link.b], own[link.b].poses[members.j])
-        off = group.to_plane(group.between(group.between(T_map_i, T_map_j), members.T_i_j))
-        x, y, theta = np.median(np.abs(off), axis=0)
-        return bool(np.hypot(x, y) <= DISTINCT_M and theta <= DISTINCT_RAD)
+        off = group.between(group.between(T_map_i, T_map_j), members.T_i_j)
+        return bool(np.median(group.shift_m(off)) <= DISTINCT_M and np.median(group.turn_rad(off)) <= DISTINCT_RAD)
 
     for relation in known:
         merge(*relation)

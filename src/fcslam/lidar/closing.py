@@ -8,7 +8,6 @@ earlier submaps and the motions to them.
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from itertools import compress
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.geometry.thinning import surplus_places
+from fcslam.graph.cluster import maximum_clique
 from fcslam.lidar.correlative import SearchWindow, search
 from fcslam.lidar.submap import Submap, read_submap, submap_bytes
 from fcslam.lidar.verification import ALIGNMENT_SCALE_M, SYMMETRY_M, SYMMETRY_RAD, Verification, verify
@@ -123,14 +123,12 @@ class LoopCloser:
         self._held: dict[int, Submap | bytes] = {}
         """The submaps that others are compared with, by index, in the order of their use; all but the last are packed.
         The oldest of a well-known area are forgotten."""
-        self._accepted: list[tuple[int, int]] = []
-        """Earlier and later submap of each accepted closure."""
-        self._pending: list[LocalClosure] = []
-
-    @property
-    def has_closures(self) -> bool:
+        self.has_closures = False
         """Whether any closure was accepted."""
-        return bool(self._accepted)
+        self._fixed: list[tuple[int, int]] = []
+        """Earlier and later submap of each accepted closure that fixes every direction: the others leave the drift
+        along a corridor as it was."""
+        self._pending: list[LocalClosure] = []
 
     def add(self, keyscan: int, travel_m: float, submap: Submap, anchors: FloatArray) -> list[LocalClosure]:
         """Compare the next submap, its anchor's number and the path length up to there with earlier ones.
@@ -146,7 +144,7 @@ class LoopCloser:
             if isinstance(held := self._held[index], Submap):
                 self._held[index] = submap_bytes(held)
         is_known = self._forget_surplus(anchors)
-        closures = np.array(self._accepted, dtype=np.int64).reshape(-1, 2)
+        closures = np.array(self._fixed, dtype=np.int64).reshape(-1, 2)
         paths: FloatArray = _shortest_paths(later, np.diff(self._travel), closures, CLOSURE_PATH_M)
         candidates = self._candidates(later, anchors, paths)
         found = [
@@ -265,7 +263,8 @@ class LoopCloser:
         cluster = supported(self._pending, self._travel, anchors)
         accepted += cluster
         self._pending = [c for c in self._pending if c not in cluster]
-        self._accepted += [(c.earlier, c.later) for c in accepted]
+        self._fixed += [(c.earlier, c.later) for c in accepted if c.check.informative]
+        self.has_closures |= bool(accepted)
         return accepted
 
     @staticmethod
@@ -285,16 +284,17 @@ def drift_allowance(path_m: ArrayLike) -> FloatArray:
 def supported(pending: Sequence[LocalClosure], travel: FloatArray, anchors: FloatArray) -> list[LocalClosure]:
     """The closures that support each other enough to be accepted, whatever their order.
 
-    A cluster is a closure with all those consistent with it. If several are large enough, the one with the most support
-    counts; of equal ones, the latest. ``travel`` (S,) is the path length up to each submap, and ``anchors`` (S, 3) are
-    the poses of their anchors.
+    A cluster is a closure with the most others that are consistent with it and with one another. If several are large
+    enough, the one with the most support counts; of equal ones, the latest. ``travel`` (S,) is the path length up to
+    each submap, and ``anchors`` (S, 3) are the poses of their anchors.
     """
     if len(pending) < MINIMUM_SUPPORT:
         return []
     consistent = consistency(pending, travel, anchors)
     best: tuple[float, list[LocalClosure]] = 0.0, []
     for row in consistent[::-1]:
-        cluster = list(compress(pending, row))
+        near = np.flatnonzero(row)
+        cluster = [pending[near[k]] for k in maximum_clique(consistent[np.ix_(near, near)])[0]]
         support = sum(c.check.support for c in cluster)
         is_spread = np.ptp(travel[[c.later for c in cluster]]) >= MINIMUM_SPREAD_M
         informative = any(c.check.informative for c in cluster)

@@ -23,8 +23,9 @@ NO_PRIOR = np.zeros((3, 3))
 _VERIFIED = Reason(ReasonCode.VERIFIED)
 ALIGNMENT_SCALE_M = 0.4
 """A guess between submaps is worse than one between scans: the loss starts wider."""
-INFORMATIVE = 30.0
-"""Least eigenvalue of the normal tensor of an informative closure; a corridor has less."""
+INFORMATIVE, INFORMATIVE_SHARE = 30.0, 0.1
+"""Least eigenvalue of the normal tensor of an informative closure, and its least share of the number of points: along a
+bare corridor, the noise of the normals alone gives 0.02 to 0.1."""
 CLOSURE_SIGMA_M = 0.03
 CLOSURE_SIGMA_RAD = 0.2 * CLOSURE_SIGMA_M
 """Least standard deviations of a closure, however many points it has."""
@@ -47,9 +48,9 @@ class Gate:
     """Least share of all points that lie in known area."""
 
 
-STRICT = Gate(explained=0.80, violation=0.05, count=250, overlap=0.25)
+STRICT = Gate(explained=0.80, violation=0.05, count=150, overlap=0.25)
 """Gate of a closure that no estimate predicts."""
-LOOSE = Gate(explained=0.70, violation=0.10, count=250, overlap=0.25)
+LOOSE = Gate(explained=0.70, violation=0.10, count=150, overlap=0.25)
 """Gate of a closure that an estimate predicts."""
 PARTIAL = Gate(explained=0.65, violation=0.22, count=500, overlap=0.5)
 """Gate of a partially supported closure: much overlap, but bent submaps (outdoors, on a slope). It counts half in a
@@ -64,8 +65,7 @@ class Verification:
     information: FloatArray
     """Information of T_a_b in the tangent space at T_a_b (coordinates of b), shape (3, 3)."""
     worse: Agreement
-    """The direction whose explained share less violation is lower, with the worse violation and count of both, and the
-    better overlap: a small submap may lie within a large one."""
+    """The worse of both directions in each measure, and the better overlap: a small submap may lie in a large one."""
     strict: bool
     loose: bool
     partial: bool
@@ -127,13 +127,12 @@ def align(a: Submap, b: Submap, T_a_b_guess: FloatArray, prior: FloatArray = NO_
     gap = se2.between(T_a_b, T_a_b_back)
     T_a_b = se2.compose(T_a_b, 0.5 * gap)
     sides = agreement(b, a, T_a_b), agreement(a, b, se2.inverse(T_a_b))
-    worse = min(sides, key=lambda side: side.explained - side.violation)
     worse = Agreement(
-        worse.explained,
+        min(side.explained for side in sides),
         max(side.violation for side in sides),
         min(side.count for side in sides),
         max(side.overlap for side in sides),
-        worse.normal_tensor,
+        min(sides, key=lambda side: side.weakest).normal_tensor,
     )
     information = limited_information(
         forward.information + prior, float(T_a_b[2]), (UNFIXED, UNFIXED, UNFIXED), LEAST_VARIANCE
@@ -156,8 +155,9 @@ def judge(
     symmetric = asymmetric is None
     if asymmetric is not None:
         noise = no_noise  # it takes two submaps, and decides nothing
-    informative = weakest >= INFORMATIVE
-    one_direction = Reason(ReasonCode.ONE_DIRECTION, weakest, INFORMATIVE)
+    least = _least_eigenvalue(worse)
+    informative = weakest >= least
+    one_direction = Reason(ReasonCode.ONE_DIRECTION, weakest, least)
     not_strict = _shortfall(worse, STRICT, no_noise if predicted else noise)
     not_loose = _shortfall(worse, loose, noise if predicted else no_noise)
     return Verification(
@@ -176,6 +176,10 @@ def judge(
 def _sample(surface: PointScan) -> PointScan:
     """About ``ALIGNED_POINTS`` points: more add little. Copied, so that compiled code sees one memory layout."""
     return surface.only(np.arange(0, len(surface), max(1, len(surface) // ALIGNED_POINTS)))
+
+
+def _least_eigenvalue(found: Agreement) -> float:
+    return max(INFORMATIVE, INFORMATIVE_SHARE * found.count)
 
 
 def _asymmetry(gap: FloatArray) -> Reason | None:

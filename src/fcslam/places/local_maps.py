@@ -96,9 +96,11 @@ class LocalMaps:
         poses_a, poses_b = self._poses
         places = [row for row in self._places if np.isfinite(T_a_b[row, 0])]
         in_a = se2.compose(T_a_b[places], poses_b[places])
-        found_m, found_rows = cKDTree(poses_a[:, :2]).query(in_a[:, :2], distance_upper_bound=LOCAL_M)
+        found_m, found_rows = cKDTree(poses_a[:, :2]).query(in_a[:, :2], distance_upper_bound=LOCAL_RADIUS_M)
         nearest = np.asarray(found_rows)
-        near = _at_most(np.flatnonzero(np.isfinite(found_m)), MOST_LOCAL_MAPS)
+        # Paths that never come near each other may have seen the same walls from two sides.
+        reach_m = LOCAL_M if np.any(found_m <= LOCAL_M) else LOCAL_RADIUS_M
+        near = _at_most(np.flatnonzero(found_m <= reach_m), MOST_LOCAL_MAPS)
         rows = [(int(nearest[k]), int(places[k])) for k in near]
         maps = [(self._at(0, i), self._at(1, j)) for i, j in rows]
         noises = [noise_of(filter(None, side)) for side in zip(*maps, strict=True)]
