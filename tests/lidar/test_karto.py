@@ -22,7 +22,7 @@ def test_the_setting_selects_it_and_a_drive_is_tracked():
     frontend, local, keyscans = LidarFrontend("r", LidarConfig(tracker="karto")), [], 0
     for scan in recording(truth, odometry, ring()):
         tracking = frontend.localize(scan)
-        keyscans += frontend.process(scan, tracking).keyscan is not None
+        keyscans += frontend.process(scan, tracking)[1] is not None
         local.append(tracking.tracked.T_local_base)
         assert tracking.tracked.scan is not None or not tracking.tracked.information.any()
     shift, turn = pose_errors(np.array(local), truth)

@@ -26,14 +26,16 @@ class Mapped:
     def __init__(self, scans, config=None):
         config = config or LidarConfig()
         frontend, self.backend = LidarFrontend("r", config), LidarBackend("r", config)
-        self.steps, self.submaps = [], []
+        self.tracked, self.mapped, self.submaps = [], [], []
         for scan in scans:
-            self.steps.append(step := frontend.process(scan))
-            if step.keyscan is not None:
-                self.submaps += filter(None, [self.backend.add(step.keyscan)])
+            pose, keyscan = frontend.process(scan)
+            self.tracked.append(pose)
+            self.mapped.append(keyscan)
+            if keyscan is not None:
+                self.submaps += filter(None, [self.backend.add(keyscan)])
         self.submaps += self.backend.finish()
         anchors = [submap.anchor for submap in self.submaps]
-        mapped = [step.keyscan for step in self.steps if step.keyscan is not None]
+        mapped = list(filter(None, self.mapped))
         self.travel = np.array([keyscan.travel_m for keyscan in mapped])
         local = np.array([keyscan.T_local_base for keyscan in mapped])
         before = np.searchsorted(anchors, np.arange(len(local)), side="right") - 1
@@ -42,12 +44,12 @@ class Mapped:
 
     @property
     def poses(self):
-        poses = [step.pose for step in self.steps]
-        return se2.compose(self.keyscans[[p.keyscan for p in poses]], np.array([p.T_keyscan_base for p in poses]))
+        offsets = np.array([pose.T_keyscan_base for pose in self.tracked])
+        return se2.compose(self.keyscans[[pose.keyscan for pose in self.tracked]], offsets)
 
     @property
     def odometry(self):
-        return [k.odometry for step in self.steps if (k := step.keyscan) is not None and k.odometry is not None]
+        return [k.odometry for k in self.mapped if k is not None and k.odometry is not None]
 
     @property
     def closures(self):
@@ -55,7 +57,7 @@ class Mapped:
 
     def false_closures(self, truth, limit_m=0.5):
         """Closures whose measured motion is off the true one, by how much."""
-        at = truth[[k for k, step in enumerate(self.steps) if step.keyscan is not None]]
+        at = truth[[k for k, keyscan in enumerate(self.mapped) if keyscan is not None]]
         rest = [se2.between(se2.between(at[c.i], at[c.j]), c.T_i_j) for c in self.closures]
         return [(c.i, c.j, r) for c, r in zip(self.closures, rest, strict=True) if np.hypot(r[0], r[1]) > limit_m]
 
@@ -87,14 +89,14 @@ def test_a_loop_is_closed(truth, scans, mapped):
 
 
 def test_every_scan_has_a_pose_and_every_keyscan_a_place_in_the_chain(scans, mapped):
-    assert [step.pose.stamp for step in mapped.steps] == [scan.stamp for scan in scans]
-    numbers = [step.keyscan.record.id.number for step in mapped.steps if step.keyscan is not None]
+    assert [pose.stamp for pose in mapped.tracked] == [scan.stamp for scan in scans]
+    numbers = [keyscan.record.id.number for keyscan in mapped.mapped if keyscan is not None]
     assert numbers == list(range(len(mapped.keyscans)))
     assert {c.kind for c in mapped.odometry} == {ConstraintKind.ODOMETRY}
     assert {c.kind for c in mapped.closures} == {ConstraintKind.CLOSURE}
     assert [(c.i, c.j) for c in mapped.odometry] == [(k, k + 1) for k in range(len(numbers) - 1)]
     assert np.isfinite(mapped.poses).all()
-    near = np.array([step.pose.T_keyscan_base for step in mapped.steps])
+    near = np.array([pose.T_keyscan_base for pose in mapped.tracked])
     assert np.hypot(*near[:, :2].T).max() < 0.4
 
 

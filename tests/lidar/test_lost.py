@@ -64,9 +64,9 @@ def test_looking_leaves_no_trace(around):
     for scan in around[80:90]:
         looked.localize(scan)
     again = [looked.process(scan) for scan in around[80:90]]
-    for step, other in zip(again, (plain.process(scan) for scan in around[80:90]), strict=True):
-        assert np.array_equal(step.pose.T_keyscan_base, other.pose.T_keyscan_base)
-        assert step.pose.keyscan == other.pose.keyscan
+    for (pose, _), (other, _) in zip(again, (plain.process(scan) for scan in around[80:90]), strict=True):
+        assert np.array_equal(pose.T_keyscan_base, other.T_keyscan_base)
+        assert pose.keyscan == other.keyscan
 
 
 def test_scans_of_one_drive_are_hardly_doubted_and_never_lost(around):
@@ -125,8 +125,7 @@ def test_another_local_map_is_tied_to_the_past_by_odometry_alone(around):
     past_m = frontend.travel_m
     frontend.begin_local_map()
     assert frontend.settled_m == 0.0
-    steps = [frontend.process(scan) for scan in around[60:75]]
-    first, second = [step.keyscan for step in steps if step.keyscan is not None][:2]
+    first, second, *_ = filter(None, (frontend.process(scan)[1] for scan in around[60:75]))
     assert first.travel_m > past_m
     # The motion is that of odometry, and its information that of the model, much less than with a match.
     assert 10.0 * first.odometry.information[0, 0] < second.odometry.information[0, 0]

@@ -7,8 +7,7 @@ It works in the smooth local frame of the tracker and never reads the pose graph
 import math
 from collections import deque
 from dataclasses import dataclass
-from enum import StrEnum
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -56,15 +55,6 @@ FLOOR_SIGMA_RAD = FLOOR_SIGMA_M / LEVER_M
 error that more points do not reduce."""
 
 
-class Tracker(StrEnum):
-    """How scans are matched."""
-
-    SURFELS = "surfels"
-    """Every scan, by Gauss-Newton on surfels."""
-    KARTO = "karto"
-    """As Karto: scans that moved on enough, by exhaustive search on a likelihood grid."""
-
-
 class KeyscanConfig(Settings):
     """Which scans become keyscans, and the size of submaps."""
 
@@ -98,8 +88,8 @@ class LidarConfig(Settings):
         description="corners [[x, y], ...] of the robot's body in base, as the parameter `footprint` of Nav2; returns "
         "within it are left out [m]",
     )
-    tracker: Tracker = Field(
-        default=Tracker.SURFELS,
+    tracker: Literal["surfels", "karto"] = Field(
+        default="surfels",
         description="how scans are matched: `surfels`, every scan by Gauss-Newton; `karto`, each scan that may become "
         "a keyscan by exhaustive search on a grid, as on the robots of the paper",
     )
@@ -131,13 +121,6 @@ class MappedKeyscan:
     """Path length up to it, metres; turns count as ``TURN_AS_TRAVEL_M`` per radian."""
 
 
-class Step(NamedTuple):
-    """Everything that one scan added."""
-
-    pose: ScanPose
-    keyscan: MappedKeyscan | None = None
-
-
 class LidarFrontend:
     """Tracks one robot scan by scan and selects keyscans."""
 
@@ -165,8 +148,11 @@ class LidarFrontend:
         """Find the pose of the next scan; nothing changes before ``process``."""
         return self.tracker.localize(scan)
 
-    def process(self, scan: LaserScan, tracking: TrackingResult | None = None) -> Step:
-        """Process the next scan, with its result of ``localize`` if that was called before; returns what it became."""
+    def process(self, scan: LaserScan, tracking: TrackingResult | None = None) -> tuple[ScanPose, MappedKeyscan | None]:
+        """Process the next scan, with its result of ``localize`` if that was called before.
+
+        Returns its pose, and the keyscan that it became.
+        """
         # 1. Scan matching against the running buffer.
         tracking = self.tracker.localize(scan) if tracking is None else tracking
         self.tracker.commit(tracking)
@@ -174,7 +160,7 @@ class LidarFrontend:
         # 2. After enough motion the scan becomes a keyscan.
         laser = laser_index(self._lasers, scan.laser)
         keyscan = self._add_keyscan(scan, tracked, laser) if self._is_keyscan(tracked, laser) else None
-        return Step(self.scan_pose(scan.stamp, tracked), keyscan)
+        return self.scan_pose(scan.stamp, tracked), keyscan
 
     @property
     def lasers(self) -> tuple[LaserModel, ...]:
@@ -268,7 +254,7 @@ def laser_index(known: list[LaserModel], laser: LaserModel) -> int:
 
 
 def _tracker(config: LidarConfig, odometry: OdometryModel) -> ScanTracker:
-    if config.tracker is Tracker.SURFELS:
+    if config.tracker == "surfels":
         return ScanTracker(odometry)
     return KartoTracker(odometry, config.keyscans.minimum_travel_distance_m, KEYSCAN_TURN_RAD)
 

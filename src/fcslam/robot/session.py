@@ -93,20 +93,20 @@ class Session:
         self, scan: LaserScan, tracking: TrackingResult, fixes: Iterable[GnssFix]
     ) -> tuple[ScanPose, list[BackendInput]]:
         """Continue from a localized scan; returns its pose, the keyscan that it becomes, and the fixes of keyscans."""
-        step = self.lidar.process(scan, tracking)
+        pose, keyscan = self.lidar.process(scan, tracking)
         inputs: list[BackendInput] = []
-        if step.keyscan is not None:
-            if step.keyscan.odometry is not None:
-                self.poses.extend(step.keyscan.odometry.T_i_j)
-            inputs.append(NewKeyscan(step.keyscan, self.lidar.lasers))
-        self.poses.add(step.pose)
-        inputs.extend(self._keyscan_fixes(step.pose, fixes))
-        self.newest = scan, step.pose
+        if keyscan is not None:
+            if keyscan.odometry is not None:
+                self.poses.extend(keyscan.odometry.T_i_j)
+            inputs.append(NewKeyscan(keyscan, self.lidar.lasers))
+        self.poses.add(pose)
+        inputs.extend(self._keyscan_fixes(pose, fixes))
+        self.newest = scan, pose
         self._scans[scan.laser.T_base_laser] = scan
         if tracking.explained >= DOUBTFUL * tracking.known:  # false if it was not matched
             self._explained[scan.laser.T_base_laser] = scan
         self._jumps = self.motion.jumps
-        return step.pose, inputs
+        return pose, inputs
 
     def view(self, image: CameraImage) -> NewImage | None:
         """An image with the newest scans; None before the first scan."""

@@ -6,7 +6,7 @@ Flower's SuperLink and SuperNode are not used: they run whatever app a caller su
 import logging
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Final
 
 import numpy as np
@@ -32,24 +32,14 @@ StrategyFactory = Callable[..., FedAvg]
 """A subclass of Flower's FedAvg that aggregates by the replies alone. A checkpoint keeps no state of it."""
 
 
-@dataclass(frozen=True, slots=True)
-class StrategyReply:
-    """A robot's update as a strategy reads it: the part of Flower's ``Message`` that strategies use."""
-
-    content: RecordDict
-
-    def has_error(self) -> bool:
-        """Updates with errors are left out before."""
-        return False
-
-
 def flower_aggregate(strategy: StrategyName | StrategyFactory) -> Aggregate:
     """Aggregation by a strategy of Flower: one that the settings name, or of your own."""
     named = {"fedavg": FedAvg, "fedmedian": FedMedian}
     chosen = (named[strategy] if isinstance(strategy, str) else strategy)()
 
     def aggregate(round_number: int, updates: Sequence[Weights]) -> Weights:
-        replies = [StrategyReply(_record(update, chosen)) for update in updates]
+        # The part of Flower's ``Message`` that strategies use; updates with errors are left out before.
+        replies = [SimpleNamespace(content=_record(update, chosen), has_error=lambda: False) for update in updates]
         arrays, _ = chosen.aggregate_train(round_number, replies)
         return {str(name): array.numpy() for name, array in arrays.items()}
 
