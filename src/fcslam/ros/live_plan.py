@@ -18,7 +18,7 @@ from fcslam.sources.bags.rig import (
     rig_of,
     tilt_note,
 )
-from fcslam.sources.bags.transforms import USUAL_BASES, Link, NoTransformError, TransformTree
+from fcslam.sources.bags.transforms import Link, NoTransformError, TransformTree
 from fcslam.sources.path_summary import without_odometry
 
 USUAL_ODOM: Final = "odom"
@@ -71,7 +71,7 @@ class LivePlanner:
     @property
     def known_base_frame(self) -> str:
         """The frame of the odometry, or else a usual one that tf has."""
-        return self.base_frame or next((frame for frame in USUAL_BASES if frame in self.tree), USUAL_BASES[-1])
+        return self.base_frame or self.tree.usual_base
 
     def add_scan(self, scan: ScanMessage, is_stamped: bool = True) -> None:
         """Take one of the first scans of a laser; those without a stamp are not enough, as others show the clock."""

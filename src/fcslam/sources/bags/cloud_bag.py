@@ -15,7 +15,6 @@ from fcslam.sources.bags.plan import BagPlan, plan_of
 from fcslam.sources.bags.reader import CloudStream
 from fcslam.sources.bags.robots import slashed
 from fcslam.sources.bags.rosbag import RosBag
-from fcslam.sources.bags.transforms import USUAL_BASES
 from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, CloudRecording, reader_of
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import FIRST_MESSAGES
@@ -48,8 +47,9 @@ class CloudBag(CloudRecording):
         """As in ``CloudRecording``."""
         _, notes = self._reader
         plan, track = self._plan, PathSummary()
-        for message in self._bag.bag.read(plan.odometry.topics if plan.odometry else ()):
-            for reading in next(valid([message], plan.odometry.readings), []) if plan.odometry else ():
+        if plan.odometry is not None:
+            readings = valid(self._bag.bag.read(plan.odometry.topics), plan.odometry.readings)
+            for reading in chain.from_iterable(readings):
                 track.add(reading.stamp, reading.T_odom_base)
         first_ns, last_ns = self._bag.bag.census[self._topic].span_ns
         count = len(range(self._topic.message_count)[scans.first : scans.end])
@@ -60,7 +60,7 @@ class CloudBag(CloudRecording):
 
     def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:
         plan, (reader, _) = self._plan, self._reader
-        base_frame = self._bag.options.base_frame or next((f for f in USUAL_BASES if f in plan.tree), USUAL_BASES[-1])
+        base_frame = self._bag.options.base_frame or plan.tree.usual_base
         imu = self._bag.robot.of_type(IMU)[:1]
         odometry = () if plan.odometry is None else plan.odometry.topics
         stream, axes = CloudStream(reader, audit), ImuAxes(plan.tree, base_frame)

@@ -20,7 +20,7 @@ from fcslam.sources.bags.pairing import Message
 from fcslam.sources.bags.rig import RecordedLaser, recorded_laser
 from fcslam.sources.bags.robots import BagRobot, listed, usual
 from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
-from fcslam.sources.bags.transforms import USUAL_BASES, Link, TransformTree, is_corrected
+from fcslam.sources.bags.transforms import Link, TransformTree, is_corrected
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.motion import LARGEST_SPEED
@@ -218,8 +218,7 @@ class _Planner:
         for topic in self._measured:
             bases += [self._base_frame(topic), *self._bag.census[topic].frames]
         link = self._tree.odometry_link(frame, self._options.odom_frame)
-        usual_ones = [each for each in USUAL_BASES if each in self._tree]
-        return next(filter(None, (*bases, *(link or ())[1:], *usual_ones)), USUAL_BASES[-1])
+        return next(filter(None, (*bases, *(link or ())[1:])), self._tree.usual_base)
 
     def _scans_change(self) -> bool:
         found = self._scans.of(self._topics.scans[0])

@@ -28,7 +28,7 @@ from fcslam.sources.bags.plan import BagPlan, plan_of
 from fcslam.sources.bags.reader import Numbered, SensorReader
 from fcslam.sources.bags.rig import Rig, mounted_camera, mountings_of, rig_of, tilt_note
 from fcslam.sources.bags.robots import BagRobot, robot_of, robots_of, slashed
-from fcslam.sources.bags.transforms import USUAL_BASES, Mounting, NoTransformError
+from fcslam.sources.bags.transforms import Mounting, NoTransformError
 from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
@@ -200,7 +200,7 @@ class RosBag:
         for sample, its, recorded in zip(samples, which, lasers, strict=True):
             sample.check(self.path, its, _OF_CLOUDS if recorded.is_level else _OF_SCANS)
         placeholders = tuple(sample.placeholders() for sample in samples)
-        base_frame = base_frame or next((frame for frame in USUAL_BASES if frame in tree), USUAL_BASES[-1])
+        base_frame = base_frame or tree.usual_base
         mountings = [_moved(mounted, self.options.correction) for mounted in self._mountings(base_frame, errors)]
         camera, camera_note = None, ""
         if plan.topics.camera is not None:

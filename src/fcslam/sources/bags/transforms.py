@@ -101,6 +101,11 @@ class TransformTree:
     def __contains__(self, frame: str) -> bool:
         return frame in self._parents or any(parent == frame for parent, _ in self.links)
 
+    @property
+    def usual_base(self) -> str:
+        """A usual frame of the robot's body, one that is there if there is any."""
+        return next((frame for frame in USUAL_BASES if frame in self), USUAL_BASES[-1])
+
     def fixed(self, base: str, frame: str) -> Transform:
         """``T_base_frame`` along the shortest way."""
         way = self._way(base, frame, is_fixed_only=True)
