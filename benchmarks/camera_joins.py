@@ -43,11 +43,11 @@ class JoinWatch:
         self.driven_m: dict[str, float] = {}
 
     def __call__(self, cloud: MissionCloud) -> None:
-        maps = {each.robot: each.map_index for each in cloud.fleet.corrections()}
+        maps = {each.robot: each.map_index for each in cloud.host.fleet.corrections()}
         numbers = list(maps.values())
         shared = {robot for robot, number in maps.items() if numbers.count(number) > 1}
         if shared != self.driven_m.keys():
-            now = {each.robot: path_m(each.T_local_base) for each in cloud.fleet.estimate().robots}
+            now = {each.robot: path_m(each.T_local_base) for each in cloud.host.fleet.estimate().robots}
             self.driven_m = {robot: self.driven_m.get(robot, now[robot]) for robot in shared}
 
 

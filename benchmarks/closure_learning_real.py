@@ -239,7 +239,7 @@ def learner(
         TrainingExample(read_grey(path), Labels(found.keypoints_px, ranked(len(found.scores))))
         for path, found in zip(images, features, strict=True)
     )
-    return Learner(name, examples, tuple(pairs), ())
+    return Learner(name, examples, tuple(pairs))
 
 
 def test_sets(vision: Path) -> Iterator[tuple[str, PlaceSet, Path]]:

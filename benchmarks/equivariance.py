@@ -84,7 +84,7 @@ def _turned(detector: EvaluatedDetector, pictures: Sequence[FramedImage], angle_
         turned = np.asarray(cv2.warpPerspective(picture.grey, H, LARGE), np.uint8)
         found = (described(detector.find(each)) for each in (picture, _changed(picture, turned)))
         results.append(match_pair(*found, H))
-    shares = [(result.accuracy[2], result.corner_error_px <= 3.0) for result in results]
+    shares = [(result.accuracy[2], np.mean(result.errors_px[0] <= 3.0)) for result in results]
     accuracy, correct = np.mean(shares, axis=0)
     return float(accuracy), float(correct)
 

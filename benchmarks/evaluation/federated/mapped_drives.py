@@ -4,22 +4,22 @@ Images and LiDAR returns stay on the robots. The study has them all in one proce
 robot, or the cloud, would have.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
 
+from fcslam.cloud.report import Track
 from fcslam.features.detector import FeatureDetector, decode_grey
 from fcslam.geometry import se2
 from fcslam.learning.revisits import Keyframe
-from fcslam.mission.driving import legs
+from fcslam.mission.driving import Leg, legs
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.records import FloatArray
 from fcslam.robot.backend import BackendInput, RobotBackend, Task
 from fcslam.robot.backend_runner import inline
-from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.keyframe_folder import KeyframeImage
 from fcslam.runs import Run
 from fcslam.sources import Source
@@ -51,11 +51,15 @@ def map_drives(sources: Sequence[Source], config: MissionConfig, detector: Featu
         detector: describes the keyframes.
     """
     runners = {source.name: _Keeping(RobotBackend(source.name, config.robot)) for source in sources}
-    fronts = {name: RobotFrontend(name, config.robot, runner.submit) for name, runner in runners.items()}
-    run = run_mission(
-        sources, config, drive=lambda given, _: nullcontext([legs(source, fronts[source.name]) for source in given])
-    )
-    return {name: _drive(fronts[name], runner.kept, run, detector) for name, runner in runners.items()}
+    tracks: dict[str, Track] = {}
+
+    def noted(source: Source) -> Iterator[Leg]:
+        for leg in legs(source, config.robot, runners[source.name].submit):
+            tracks.update(leg.tracks)
+            yield leg
+
+    run = run_mission(sources, config, drive=lambda given, _: nullcontext([noted(source) for source in given]))
+    return {name: _drive(name, tracks[name], runner.kept, run, detector) for name, runner in runners.items()}
 
 
 class _Keeping:
@@ -73,10 +77,10 @@ class _Keeping:
 
 
 def _drive(
-    front: RobotFrontend, kept: tuple[KeyframeImage, ...] | None, run: Run, detector: FeatureDetector
+    robot: str, track: Track, kept: tuple[KeyframeImage, ...] | None, run: Run, detector: FeatureDetector
 ) -> MappedDrive:
     """Put the keyframes of a robot on the poses of their keyscans."""
-    track, own, fleet = front.tracks[0], run.local_maps[front.robot], run.trajectories[front.robot]
+    own, fleet = run.local_maps[robot], run.trajectories[robot]
     numbers = track.keyscans
     firsts = np.searchsorted(numbers, np.arange(numbers.max(initial=-1) + 1))
     keyframes, scans, offsets = [], [], []
@@ -88,7 +92,7 @@ def _drive(
             offsets.append(image.T_keyscan_image)
     moved = np.array(offsets).reshape(-1, 3)
     return MappedDrive(
-        front.robot,
+        robot,
         tuple(keyframes),
         fleet.stamps[scans],
         se2.compose(own.T_local_base[scans], moved),
