@@ -11,9 +11,10 @@ table measures, and on --images, such as renders. Pairs are drawn on the device 
   half of them by any angle. Labels are those of the bundled network and of Harris's measure
 - longer, mixed: `near`, trained on. A quarter of the pairs of `mixed` change as in `wide`. The learning rate rises
   again and falls as a cosine in the second half. `mean` has the mean of the weights of both ("model soup")
-- ours, hardest, all: the paper's network from `vgg`. The last two have eqs. (1)-(3) alone for their codes, without a
-  margin, with the hardest negative of a pair or the mean over all; `ours` has the losses of `fcslam tools train`. As
-  many steps each
+- ours, hardest: the paper's network from `vgg`. The latter has eqs. (1)-(3) alone for its codes, without a margin, with
+  the hardest negative of a pair; `ours` has the losses of `fcslam tools train`. As many steps each
+- corners: the paper's network from `vgg`, with labels that OpenCV's cornerSubPix moves to corners, and the localization
+  loss: `vgg` puts keypoints several pixels inside light fields (`corners.py`)
 
 Codes: of points of 32 pairs of held-out images: bits that differ between different points of a view, and between both
 views of a point; bits that are equal at 98 % of the points; points whose nearest code in the other view is their own.
@@ -31,13 +32,14 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import common
 import torch
+from evaluation.baselines import moved_to_corners
 from evaluation.device_pairs import Change, Photographs, draw_on_device
 from evaluation.subpixel_loss import localization_loss
 from torch import Tensor
@@ -95,6 +97,8 @@ class Arm:
     """None: as many as the time allows."""
     after: str | None = None
     """The arm whose network is trained on."""
+    at_corners: bool = False
+    """Whether labels move to the nearest corner of the image."""
 
 
 def light(*changes: Change, after: str | None = None) -> Arm:
@@ -121,7 +125,13 @@ ARMS = {
     "mixed": light(*3 * [AS_IN_TRAINING], WIDE, after="near"),
     "ours": vgg(),
     "hardest": vgg(**EQUATIONS),
-    "all": vgg(**EQUATIONS, negatives="all"),
+    "corners": Arm(
+        TrainingSettings(encoder="vgg", pairs=32, side_px=192, learning_rate=5e-4),
+        (AS_IN_TRAINING,),
+        localization=2.0,
+        start=Path("vgg"),
+        at_corners=True,
+    ),
 }
 MEAN_OF = ("longer", "mixed")
 WARM_SHARE, FALL_SHARE, LAST_RATE = 0.02, 0.5, 2e-6
@@ -195,6 +205,12 @@ def labelled(files: list[ImageFile], cache: Path) -> tuple[list[TrainingExample]
     return found.train, found.held_out
 
 
+def at_corners(example: TrainingExample) -> TrainingExample:
+    """The same image with its keypoints at the nearest corners."""
+    points = moved_to_corners(example.image, example.labels.keypoints)
+    return replace(example, labels=replace(example.labels, keypoints=points))
+
+
 def bundled(start: Path, settings: TrainingSettings, folder: Path, images: list[TrainingExample]) -> KeypointNetwork:
     """A network that comes with fcslam, with the statistics of images."""
     public = [example.image for example in images]
@@ -214,6 +230,8 @@ def train_arm(
     torch.backends.cudnn.benchmark = True
     (folder / name).mkdir(exist_ok=True)
     start = arm.start if arm.after is None else folder / f"{arm.after}.onnx"
+    if arm.at_corners:
+        train_on = [at_corners(example) for example in train_on]
     network = bundled(start, settings, folder / name, train_on).to(device, memory_format=torch.channels_last)
     average = KeypointNetwork(settings.encoder).to(device).eval()
     average.load_state_dict(network.state_dict())

@@ -19,6 +19,8 @@ _CORNERS: Final = 600
 """Most corners of an image, as in the evaluation of SuperPoint (DeTone et al. 2018)."""
 _NMS_PX: Final = 4.0
 """Distance of non-maximum suppression of corners."""
+_WINDOW_PX = 5
+"""Half the side of the window in which a keypoint is moved to a corner, less half a pixel."""
 _FAST_THRESHOLD: Final = 10
 """OpenCV's default for FAST corners [grey levels of 255]."""
 _SIFT_NUMBERS: Final = 128
@@ -100,3 +102,13 @@ class ShiTomasi:
 def _strongest(positions: FloatArray, responses: FloatArray) -> Keypoints:
     corners, _ = ranked(positions, responses)
     return corners.take(box_nms(corners.keypoints_px, _NMS_PX)[:_CORNERS])
+
+
+def moved_to_corners(image: GreyImage, positions_px: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Positions (K, 2) at the nearest corner of an image, where one is within a few pixels (Foerstner's operator)."""
+    if not len(positions_px):
+        return positions_px
+    limits = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+    start = np.array(positions_px, np.float32)[:, None]
+    moved = cv2.cornerSubPix(image, start, (_WINDOW_PX, _WINDOW_PX), (-1, -1), limits)
+    return np.asarray(moved[:, 0], np.float32)

@@ -46,15 +46,6 @@ def test_equation_2_without_margin_by_hand():
     assert float(loss) == pytest.approx(np.mean([rows, columns]))
 
 
-def test_equation_2_with_all_negatives_by_hand():
-    distances = tensor([3.0, 2.0, 9.0], [5.0, 1.0, 4.0], [6.0, 7.0, 8.0])[None]
-    valid = torch.ones(1, 3, dtype=torch.bool)
-    loss = losses.triplet_loss(distances, everything_but_the_match(3), valid, margin=0.5, negatives="all")
-    rows = [(1.5 + 0) / 2, 0, (2.5 + 1.5) / 2]  # 3.5 - 2, 3.5 - 9; 1.5 - 5, 1.5 - 4; 8.5 - 6, 8.5 - 7
-    columns = [0, 0, (0 + 4.5) / 2]  # 3.5 - 5, 3.5 - 6; 1.5 - 2, 1.5 - 7; 8.5 - 9, 8.5 - 4
-    assert float(loss) == pytest.approx(np.mean([rows, columns]))
-
-
 def test_points_that_are_not_valid_do_not_count():
     distances = tensor([3.0, 2.0, 0.0], [5.0, 1.0, 0.0], [0.0, 0.0, 99.0])[None]
     valid = torch.tensor([[True, True, False]])

@@ -5,17 +5,12 @@ with a point: those that are valid, and neither its match nor too close to it. A
 not depend on how many points there are.
 """
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from fcslam.features.dense import CELL_PX
 from fcslam.learning.network import cell_log_probabilities
-
-Negatives = Literal["hardest", "all"]
-"""Negatives of the triplet loss: the hardest one of a pair, or all; the paper does not say."""
 
 AGREEMENT_WINDOW_PX = 16
 """Side of the windows in which keypoint maps are compared."""
@@ -43,26 +38,20 @@ def code_distances(a: Tensor, b: Tensor, rounding: float) -> Tensor:
     return (hamming.clamp(min=0.0) + rounding).sqrt()
 
 
-def triplet_loss(
-    distances: Tensor, candidates: Tensor, valid: Tensor, margin: float, negatives: Negatives = "hardest"
-) -> Tensor:
-    """Eq. (2) with negatives of either image, and a margin that the paper lacks (0 there).
+def triplet_loss(distances: Tensor, candidates: Tensor, valid: Tensor, margin: float) -> Tensor:
+    """Eq. (2) with the hardest negative of either image, and a margin that the paper lacks (0 there).
+
+    The paper does not say how a negative is drawn.
 
     Args:
         distances: (..., N, N); the diagonal holds d(c, p).
         candidates: (..., N, N) bool: pairs that may be d(c, n).
         valid: (..., N) bool: points that count.
         margin: by which the negative must be farther away than the match.
-        negatives: all of them give what random ones give in the mean.
     """
     positive = distances.diagonal(dim1=-2, dim2=-1)
-    if negatives == "hardest":
-        others = distances.masked_fill(~candidates, _FAR)
-        terms = [F.relu(margin + positive - others.amin(dim)) for dim in (-1, -2)]
-    else:
-        count = candidates.to(distances.dtype)
-        above = [F.relu(margin + positive.unsqueeze(dim) - distances) * count for dim in (-1, -2)]
-        terms = [a.sum(dim) / count.sum(dim).clamp(min=1.0) for a, dim in zip(above, (-1, -2), strict=True)]
+    others = distances.masked_fill(~candidates, _FAR)
+    terms = [F.relu(margin + positive - others.amin(dim)) for dim in (-1, -2)]
     return masked_mean(torch.stack(terms).mean(0), valid & candidates.any(-1) & candidates.any(-2))
 
 

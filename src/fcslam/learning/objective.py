@@ -33,7 +33,6 @@ class LossWeights:
     """Of eq. (2)."""
     margin: float = 1.0
     """Of eq. (2) at the end of training, to which it rises; 0 in the paper."""
-    negatives: losses.Negatives = "hardest"
     rounding: float = 0.01
     """Added under the root of eq. (3); 0 in the paper."""
     contrastive: float = 1.0
@@ -93,7 +92,7 @@ def objective(
     margin = weights.margin * (0.3 + 0.7 * progress)
     points = (maps.point_logits.float(), batch.targets, batch.seen)
     parts = {
-        "triplet": losses.triplet_loss(distances, candidates, batch.valid, margin, weights.negatives),
+        "triplet": losses.triplet_loss(distances, candidates, batch.valid, margin),
         "contrastive": losses.contrastive_loss(
             torch.tanh(first), torch.tanh(second), candidates, batch.valid, weights.temperature
         ),
