@@ -201,6 +201,14 @@ def test_two_points_that_no_rigid_motion_lays_on_one_another_are_not_taken():
     assert [c.status is ClosureStatus.ACCEPTED for c in fused.closures] == [False, True, True]
 
 
+def test_two_points_that_turn_a_map_against_the_headings_are_not_taken():
+    """Two places taken for each other are equally far apart in both maps, and turn one of them round."""
+    swapped = [replace(line, T_i_j=np.zeros(3)) for line in closures(A, B, [(8, 24), (24, 8)])]
+    log = ledger_of(swapped, closures(A, B, [(0, 0), (16, 16)]))
+    fused = fuse_rigidly(log, own_maps(a=(0, 0, 0), b=(3, 4, 2)))
+    assert [c.status is ClosureStatus.ACCEPTED for c in fused.closures] == [False, False, True, True]
+
+
 def test_words_alone_make_the_two_positions_one_in_the_live_map_as_in_the_finished_one(scripted):
     """No transform is measured: that of the script would turn the map."""
     cloud = feed(scripted(by_words(MEETINGS), fusion=RIGID), two_robots())

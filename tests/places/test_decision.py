@@ -11,12 +11,15 @@ from fcslam.lab.presets import Preset
 from fcslam.mission.mission import MissionConfig
 from fcslam.places.index import PlaceIndex
 from fcslam.places.matcher import PlaceMatcher
+from fcslam.places.vocabulary import Strategy
 from fcslam.records import Channel, KeyscanId, Place, ReasonCode, frozen
 from tests.places.test_vocabulary import walk
 
 pytestmark = pytest.mark.slow
 
-PAPER = load(MissionConfig, Preset.PAPER.file).fleet.matcher
+PRESET = load(MissionConfig, Preset.PAPER.file).fleet.matcher
+EVERY_PLACE = PRESET.vocabulary.model_copy(update={"strategy": Strategy.REBUILD})
+PAPER = PRESET.model_copy(update={"vocabulary": EVERY_PLACE})
 PLACES = 26
 L = PAPER.vocabulary.train_batch
 

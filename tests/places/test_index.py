@@ -252,6 +252,10 @@ def test_algorithm_1_trains_at_every_place_after_the_first_L_on_the_last_C():
     assert trained_on(Strategy.REBUILD, 9, capacity=6) == [(0, 0)] * 4 + [(5, 1), (6, 2), (6, 3), (6, 4), (6, 5)]
 
 
+def test_a_windowed_vocabulary_is_trained_as_often_as_places_come_that_were_enough_before():
+    assert trained_on(Strategy.WINDOWED, 12, capacity=6) == [(0, 0)] * 4 + [(5, 1)] * 5 + [(6, 2)] * 3
+
+
 def test_the_window_is_the_last_C_places():
     """Places before it have no influence on the words."""
     places = random_places(np.random.default_rng(7), 20)

@@ -2,9 +2,10 @@
 
 "When two valid matching points are obtained", their coordinates in both robots' own maps give the rotation and the
 translation between the two, eqs. (5) and (6). The paper does not say which two. Here two points are valid if they lie
-``DIRECTION_M`` or more apart and equally far in both maps, as maps are rigid, and the two most similar such matches
-count. No other closure is asked and nothing is optimized: two false matches that fit each other turn a whole map, and
-the drift within the robots' maps stays. It is here to be compared with the joint graph.
+``APART_M`` or more apart and equally far in both maps, as maps are rigid, and if the rotation that they give is about
+that of the headings at either point. The two most similar such matches count. No other closure is asked and nothing is
+optimized: two false matches that fit each other turn a whole map, and the drift within the robots' maps stays. It is
+here to be compared with the joint graph.
 
 The paper takes the coordinates of the matching places themselves and so equates where the two robots stood. A verified
 closure is more precise: the matched point is the position of its keyscan j, and ``T_i_j`` gives it in the other map.
@@ -20,15 +21,17 @@ from fcslam.cloud.closure_log import ClosureEntry
 from fcslam.cloud.result import Fusion
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import two_point_alignment
-from fcslam.graph.cluster import DIRECTION_M
+from fcslam.graph.evidence import DISTINCT_RAD
 from fcslam.records import ClosureStatus, FloatArray, LoopClosure, Reason, ReasonCode, frozen
 
+APART_M = 5.0
+"""Smallest distance of two points: where words alone decide, each is off by as much as the robots stood apart."""
 EQUAL_M = 0.5
 """Largest difference of the distances of two points in both maps. If words alone decide, the robots stood apart."""
 
 
 _Match = tuple[ClosureEntry, FloatArray]
-"""A closure, and one point that its two robots a and b saw, in the own map of each, shape (2, 2); a started first."""
+"""A closure, and one pose that its two robots a and b had, in the own map of each, shape (2, 3); a started first."""
 
 
 def fuse_rigidly(closures: Iterable[ClosureEntry], T_local_base: Mapping[str, FloatArray]) -> Fusion:
@@ -45,7 +48,7 @@ def fuse_rigidly(closures: Iterable[ClosureEntry], T_local_base: Mapping[str, Fl
     used: dict[ClosureEntry, Reason] = {}
     for robots, members in _links(valid, T_local_base).items():
         try:
-            T_a_b = two_point_alignment([points[0] for _, points in members], [points[1] for _, points in members])
+            T_a_b = two_point_alignment([poses[0, :2] for _, poses in members], [poses[1, :2] for _, poses in members])
         except ValueError:  # a robot claims to be so far away that its two points are one to a computer
             continue
         if np.isfinite(T_a_b).all() and _join(robots, T_a_b, maps, frames):
@@ -66,22 +69,27 @@ def _links(
     for entry in sorted(entries, key=lambda entry: -entry.closure.similarity):
         i, j = entry.closure.i, entry.closure.j
         T_own_i = T_local_base[i.robot][i.number]
-        points = np.stack((se2.compose(T_own_i, entry.closure.T_i_j)[:2], T_local_base[j.robot][j.number][:2]))
+        poses = np.stack((se2.compose(T_own_i, entry.closure.T_i_j), T_local_base[j.robot][j.number]))
         robots = i.robot, j.robot
         if order.index(i.robot) > order.index(j.robot):
-            robots, points = robots[::-1], points[::-1]
+            robots, poses = robots[::-1], poses[::-1]
         earlier = known.setdefault(robots, [])
-        partner = next((other for other in earlier if _are_valid(points, other[1])), None)
+        partner = next((other for other in earlier if _are_valid(poses, other[1])), None)
         if partner is not None and robots not in two:
-            two[robots] = partner, (entry, points)
-        earlier.append((entry, points))
+            two[robots] = partner, (entry, poses)
+        earlier.append((entry, poses))
     return two
 
 
-def _are_valid(points: FloatArray, others: FloatArray) -> bool:
-    """Whether one rigid motion can lay both points of one map on those of the other and they give its direction."""
-    apart_a, apart_b = np.hypot(*(points - others).T).tolist()
-    return bool(min(apart_a, apart_b) >= DIRECTION_M and abs(apart_a - apart_b) <= EQUAL_M)
+def _are_valid(poses: FloatArray, others: FloatArray) -> bool:
+    """Whether one rigid motion can lay both poses of one map on those of the other and they give its direction."""
+    (x_a, x_b), (y_a, y_b) = (poses - others)[:, :2].T
+    apart_a, apart_b = np.hypot(x_a, y_a), np.hypot(x_b, y_b)
+    if min(apart_a, apart_b) < APART_M or abs(apart_a - apart_b) > EQUAL_M:
+        return False
+    line = np.arctan2(y_a, x_a) - np.arctan2(y_b, x_b)
+    off = se2.wrap_angle(np.array([pair[0, 2] - pair[1, 2] - line for pair in (poses, others)]))
+    return bool(np.abs(off).max() < DISTINCT_RAD)
 
 
 def _join(robots: tuple[str, str], T_a_b: FloatArray, maps: list[list[str]], frames: dict[str, FloatArray]) -> bool:

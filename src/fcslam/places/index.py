@@ -222,8 +222,14 @@ class PlaceIndex(Generic[PlaceId]):
 
     def _is_due(self, i: int) -> bool:
         """Algorithm 1, line 4: whether the tree is trained after place i."""
-        is_repeated = self._config.strategy is Strategy.REBUILD
-        return i > self._config.train_batch and (is_repeated or self._trained_on is None)
+        first = self._config.train_batch + 1
+        match self._config.strategy:
+            case Strategy.REBUILD:
+                return i >= first
+            case Strategy.WINDOWED:
+                return (i + 1) % (first + 1) == 0
+            case Strategy.INCREMENTAL:
+                return i >= first and self._trained_on is None
 
     def _train_on_newest(self) -> None:
         """Algorithm 1, lines 5-9. Its two cases are one window here: D_max(0, i - C + 1) ... D_i."""

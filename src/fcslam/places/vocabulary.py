@@ -22,6 +22,7 @@ class Strategy(StrEnum):
     """When the vocabulary changes."""
 
     REBUILD = "rebuild"
+    WINDOWED = "windowed"
     INCREMENTAL = "incremental"
 
 
@@ -51,8 +52,8 @@ class VocabularyConfig(Settings):
 
     strategy: Strategy = Field(
         default=Strategy.INCREMENTAL,
-        description="when the vocabulary is trained. rebuild: at every place; incremental: once, then words split as "
-        "they fill",
+        description="when the vocabulary is trained. rebuild: at every place; windowed: whenever as many places more "
+        "have come as before the first training; incremental: once, then words split as they fill",
     )
     train_batch: int = Field(
         default=20, ge=0, description="places before the first training of the vocabulary (L of Algorithm 1)"

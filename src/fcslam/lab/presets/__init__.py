@@ -8,7 +8,7 @@ class Preset(StrEnum):
     """Named configurations."""
 
     PAPER = "paper"
-    """FC-SLAM to the letter: words alone decide, a new vocabulary at every place, rigid maps."""
+    """FC-SLAM to the letter: words alone decide, a new vocabulary for each set of places, rigid maps."""
 
     @property
     def file(self) -> Path:
