@@ -7,10 +7,11 @@ import pytest
 
 from fcslam.geometry import se3
 from fcslam.geometry.voxels import VOXEL_STEPS, voxelised
-from fcslam.lidar3d.ground import Vertical, floor_at, levelled
-from fcslam.lidar3d.surfels import FEWEST_POINTS, POINT_SIGMA_M, SurfelMap
+from fcslam.lidar3d.ground import Vertical, levelled
+from fcslam.lidar3d.surfels import POINT_SIGMA_M, SurfelMap
 from fcslam.lidar3d.tracker import Tracker3d, without_noise
 from fcslam.records import STEP_M
+from fcslam.sources.clouds_in_space import FEWEST_ON_FLOOR, floor_at
 from tests.spinning_lidar import PERIOD_S, circle, drive, room
 
 PLANE = np.array([0.4, 0.4, 0.1])
@@ -52,7 +53,7 @@ def test_no_floor_is_found_in_a_wall_or_in_a_strip() -> None:
     strip = np.column_stack((generator.uniform(-3.0, 3.0, 500), generator.normal(0.0, 0.1, 500), np.zeros(500)))
     assert floor_at(wall) is None
     assert floor_at(strip) is None
-    assert floor_at(strip[: FEWEST_POINTS - 1]) is None
+    assert floor_at(strip[: FEWEST_ON_FLOOR - 1]) is None
 
 
 def test_up_is_that_of_most_floors_though_a_robot_starts_on_a_ramp() -> None:

@@ -11,14 +11,9 @@ import numpy as np
 
 from fcslam.compiled import njit
 from fcslam.geometry import se3
-from fcslam.lidar3d.surfels import FEWEST_POINTS, THICKEST_M
 from fcslam.records import FloatArray, LaserModel, Ranges
 from fcslam.sources.point_clouds import CloudBand
 
-_REACH_M, _NEAR_M = 4.0, 0.15
-"""Points of the floor at the robot: within this distance, and this height above or below where its wheels stand."""
-_LEAST_EXTENT_M: Final = 0.3
-"""Least standard deviation of the points of a floor in every direction."""
 _SAME_FLOOR: Final = cos(radians(3.0))
 """Floors that lean by less against the vertical are level."""
 _RATE: Final = 0.02
@@ -29,21 +24,6 @@ _CELL_M, _CELLS = 0.5, 64
 """Side of a cell of the heights of the floor, and cells along a side of their square."""
 _STEP_M: Final = 0.12
 """Largest step of the floor between neighbouring cells."""
-
-
-def floor_at(points: FloatArray) -> tuple[FloatArray, float] | None:
-    """Normal (3,) and distance of the floor below the base, from points (N, 3) in ``base``; None if few show it."""
-    near = points[(np.abs(points[:, 2]) < _NEAR_M) & (np.hypot(points[:, 0], points[:, 1]) < _REACH_M)]
-    for _ in range(2):
-        if len(near) < FEWEST_POINTS:
-            return None
-        middle = near.mean(axis=0)
-        variances, axes = np.linalg.eigh(np.cov((near - middle).T))
-        normal = axes[:, 0] * np.copysign(1.0, axes[2, 0])
-        off = np.abs((near - middle) @ normal)
-        near = near[off < max(2.0 * np.sqrt(variances[0]), 0.02)]
-    is_floor = variances[1] > _LEAST_EXTENT_M**2 and variances[0] < THICKEST_M**2
-    return (normal, float(normal @ middle)) if is_floor else None
 
 
 class Vertical:

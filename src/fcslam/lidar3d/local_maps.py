@@ -7,10 +7,11 @@ import numpy as np
 
 from fcslam.geometry import se3
 from fcslam.geometry.voxels import VOXEL_STEPS, to_steps, voxelised
-from fcslam.lidar3d.ground import Vertical, floor_at, levelled
+from fcslam.lidar3d.ground import Vertical, levelled
 from fcslam.lidar3d.surfels import SurfelMap
 from fcslam.lidar3d.tracker import MOST_POINTS, Tracked, fit_rigid, inverse, thinned
 from fcslam.records import STEP_M, FloatArray, KeyscanId, VoxelMap
+from fcslam.sources.clouds_in_space import floor_at
 
 _STEP_M, _STEP_RAD = 0.5, 0.4
 """Motion after which a turn of the LiDAR is a keyframe."""

@@ -20,9 +20,9 @@ SIZES_M: Final = (0.8, 0.4, 0.2)
 """Edges of the voxels, from the largest on."""
 POINT_SIGMA_M: Final = 0.02
 """Standard deviation of a point along the normal of its surface."""
-THICKEST_M: Final = 2.0 * POINT_SIGMA_M
+_THICKEST_M: Final = 2.0 * POINT_SIGMA_M
 """Largest standard deviation of the points of a surfel along its normal."""
-FEWEST_POINTS: Final = 6
+_FEWEST_POINTS: Final = 6
 """Least number of points of a surfel."""
 _WIDEST_RATIO: Final = 0.06
 """Largest ratio of the two smallest variances of the points of a surfel: along the normal, and across."""
@@ -184,7 +184,7 @@ def _fit_planes(stats, planes, rows):  # type: ignore[no-untyped-def]
     for row in rows:
         s, plane = stats[row], planes[row]
         n = s[0]
-        if n < FEWEST_POINTS:
+        if n < _FEWEST_POINTS:
             continue
         mx, my, mz = s[1] / n, s[2] / n, s[3] / n
         C[0, 0], C[0, 1], C[0, 2] = s[4] / n - mx * mx, s[5] / n - mx * my, s[6] / n - mx * mz
@@ -194,7 +194,7 @@ def _fit_planes(stats, planes, rows):  # type: ignore[no-untyped-def]
         measured = max(values[0], 0.0)
         thin = measured * n / (n - 3.0)  # three points always lie in a plane
         is_line = values[1] < POINT_SIGMA_M**2
-        if is_line or thin > THICKEST_M**2 or thin > _WIDEST_RATIO * values[1]:
+        if is_line or thin > _THICKEST_M**2 or thin > _WIDEST_RATIO * values[1]:
             plane[6] = 0.0
             continue
         nx, ny, nz = vectors[0, 0], vectors[1, 0], vectors[2, 0]

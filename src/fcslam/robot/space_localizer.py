@@ -17,7 +17,7 @@ from fcslam.geometry.groups import SE3
 from fcslam.graph.evidence import AGREES_M, AGREES_RAD
 from fcslam.lidar.frontend import MappedKeyscan
 from fcslam.lidar.scan import keyscan_points
-from fcslam.lidar3d.ground import floor_at, levelled
+from fcslam.lidar3d.ground import levelled
 from fcslam.lidar3d.local_maps import MappedTurn
 from fcslam.lidar3d.surfels import SurfelMap
 from fcslam.lidar3d.tracker import MOST_POINTS, fit_rigid, thinned
@@ -25,7 +25,7 @@ from fcslam.records import Constraint, ConstraintKind, FloatArray, Keyscan, froz
 from fcslam.robot.backend import NewKeyscan, Task
 from fcslam.robot.frontend3d import RobotFrontend3d
 from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
-from fcslam.sources.clouds_in_space import BAND_LASER
+from fcslam.sources.clouds_in_space import BAND_LASER, floor_at
 from fcslam.wire.messages import Hello, Packet
 
 _AT_ONCE: Final = 10_000

@@ -17,6 +17,7 @@ from fcslam.sources.gate import check_consistency, scan_window
 from fcslam.sources.point_clouds import (
     DIRECTIONS,
     FARTHEST_M,
+    FLOOR_REACH_M,
     CloudBand,
     CloudMounting,
     PointCloud,
@@ -35,9 +36,16 @@ _FASTEST_RAD_S: Final = 40.0 * tau
 """No LiDAR turns faster."""
 _FLOOR_M, _FLOOR_SHARE = 0.15, 0.05
 """Points this near to a plane are on it; least share of the points that are on a floor."""
+FEWEST_ON_FLOOR: Final = 6
+"""Points of a floor, at least."""
+_LEAST_EXTENT_M, _THICKEST_M = 0.3, 0.04
+"""Least standard deviation of the points of a floor in every direction, and the largest along its normal."""
 _BELOW_SHARE, _OPENINGS = 0.1, 10.0
 """A LiDAR that is mounted otherwise sees more points below the floor than this share; as it is, this many times fewer.
 """
+_FEW_FLOORS: Final = 0.1
+"""Of its clouds, at most this share shows a floor where the mounting has it. Of a right mounting, at least 0.2 do, and
+fewer points are below."""
 
 
 class CloudRecording(ABC):
@@ -124,9 +132,15 @@ def reader_of(
     period_s = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     is_timed = any(len(cloud.times_s) for cloud in first)
     xy = [(cloud.points @ mounting.rotation.T)[:, :2] for cloud in first]
-    is_in_order = 2 * len(_turns(xy, [np.linspace(0.0, 1.0, len(each)) for each in xy])) > len(xy)
+    in_order = _turns(xy, [np.linspace(0.0, 1.0, len(each)) for each in xy])
+    is_in_order = 2 * len(in_order) > len(xy)
     if is_timed and is_in_order:
         rates = _turns(xy, [cloud.times_s for cloud in first])
+        if len(rates) and np.median(rates) * np.median(in_order) < 0.0:
+            notes.append(
+                f"{where}: the times of the points fall from the first to the last, so the LiDAR is taken to turn "
+                "backwards; correct the times in the driver, unless it really sends the last point first"
+            )
         is_timed = 2 * len(rates) > len(xy) and float(np.median(np.abs(rates))) < _FASTEST_RAD_S
         if not is_timed:
             notes.append(
@@ -143,14 +157,31 @@ def reader_of(
         notes.append(
             f"{where}: many points are below the floor, so the LiDAR is upside down; corrected: correct it in tf"
         )
-    elif on_floor < _FLOOR_SHARE and all(
-        floor_in(cloud.points @ mounting.rotation.T + mounting.position_m, mounting) is None for cloud in first
+    elif (on_floor < _FLOOR_SHARE and not any(floor_in(points, mounting) for points in _in_base(first, mounting))) or (
+        below > _BELOW_SHARE
+        and sum(floor_at(points, FLOOR_REACH_M) is not None for points in _in_base(first, mounting))
+        <= _FEW_FLOORS * len(first)
     ):
         notes.append(
             f"{where}: no floor is seen where the mounting has it, so maps are levelled by the IMU, or else as the "
             "LiDAR is mounted; check its pose in tf"
         )
     return CloudReader(mounting, is_timed, period_s, band.body_radius_m), tuple(notes)
+
+
+def floor_at(points: FloatArray, reach_m: float = 4.0) -> tuple[FloatArray, float] | None:
+    """Normal (3,) and distance of the floor below the base, from points (N, 3) in ``base``; None if few show it."""
+    near = points[(np.abs(points[:, 2]) < _FLOOR_M) & (np.hypot(points[:, 0], points[:, 1]) < reach_m)]
+    for _ in range(2):
+        if len(near) < FEWEST_ON_FLOOR:
+            return None
+        middle = near.mean(axis=0)
+        variances, axes = np.linalg.eigh(np.cov((near - middle).T))
+        normal = axes[:, 0] * np.copysign(1.0, axes[2, 0])
+        off = np.abs((near - middle) @ normal)
+        near = near[off < max(2.0 * np.sqrt(variances[0]), 0.02)]
+    is_floor = variances[1] > _LEAST_EXTENT_M**2 and variances[0] < _THICKEST_M**2
+    return (normal, float(normal @ middle)) if is_floor else None
 
 
 def _turns(xy: Sequence[FloatArray], times_s: Sequence[NDArray[np.float64]]) -> list[float]:
@@ -165,9 +196,13 @@ def _elevations(cloud: PointCloud) -> float:
     return float(high - low)
 
 
+def _in_base(first: Sequence[PointCloud], mounting: CloudMounting) -> list[FloatArray]:
+    return [cloud.points @ mounting.rotation.T + mounting.position_m for cloud in first]
+
+
 def _on_floor(first: Sequence[PointCloud], mounting: CloudMounting) -> CloudMounting | None:
     """The mounting with the height above the floor that most clouds show; None if most show no floor."""
-    floors = [floor_in(cloud.points @ mounting.rotation.T + mounting.position_m, mounting) for cloud in first]
+    floors = [floor_in(points, mounting) for points in _in_base(first, mounting)]
     heights_m = [float(normal @ mounting.position_m) - distance_m for normal, distance_m in filter(None, floors)]
     if 2 * len(heights_m) < len(first):
         return None
@@ -177,5 +212,5 @@ def _on_floor(first: Sequence[PointCloud], mounting: CloudMounting) -> CloudMoun
 
 def _shares(first: Sequence[PointCloud], mounting: CloudMounting) -> tuple[float, float]:
     """Shares of the points on the floor, and below it."""
-    points = np.concatenate([cloud.points @ mounting.rotation.T + mounting.position_m for cloud in first])
+    points = np.concatenate(_in_base(first, mounting))
     return float(np.mean(np.abs(points[:, 2]) < _FLOOR_M)), float(np.mean(points[:, 2] < -_FLOOR_M))
