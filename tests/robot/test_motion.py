@@ -1,13 +1,14 @@
 """Robots with a scanner that spins: with odometry, without, and with odometry that is wrong."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.frontend import LidarConfig
-from fcslam.records import Keyscan, Odometry, frozen
+from fcslam.records import CameraImage, CameraModel, Keyscan, Odometry, Transform, frozen
 from fcslam.robot.calibrating import calibrate_bag, calibrated
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source, write_bag
@@ -190,3 +191,20 @@ def test_a_robot_at_rest_keeps_its_odometry():
     frontend, _ = mapped([scan] * 40)
     assert frontend.motion.model.is_measured
     assert len(frontend.tracks) == 1
+
+
+def test_without_odometry_an_image_is_where_the_robot_was_at_its_stamp():
+    camera = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0, Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+    scans, frontend = list(spinning.drive(8.0)), RobotFrontend("r", RobotConfig())
+    errors = []
+    for scan, after in pairwise(scans):
+        frontend.process(scan)
+        half = 0.5 * (after.stamp - scan.stamp)
+        image = CameraImage(scan.stamp + half, b"", camera, np.full(3, np.nan))
+        placed = frontend.motion.place_image(image).T_odom_base
+        true = se2.between(spinning.pose_at(scan.stamp), spinning.pose_at(scan.stamp + half))
+        if placed is not None:
+            newest = frontend.motion.place_image(replace(image, stamp=scan.stamp)).T_odom_base
+            errors.append(se2.between(true, se2.between(newest, placed)))
+    assert len(errors) > 0.8 * len(scans)
+    assert (np.median(np.abs(errors), axis=0) < (0.002, 0.002, 0.01)).all()

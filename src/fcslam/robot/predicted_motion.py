@@ -87,6 +87,13 @@ class MotionPrediction:
         self._T_odom_base = se2.compose(self._T_odom_base, motion)
         return replace(scan, T_odom_base=frozen(self._T_odom_base), sweep=sweep)
 
+    def at(self, stamp: float) -> FloatArray | None:
+        """The pose (3,) at a stamp after the last scan, in the frame of the predictions; None if it is not known."""
+        share = -1.0 if self._last is None or not self._elapsed_s else (stamp - self._last[0]) / self._elapsed_s
+        if not 0.0 <= share <= LARGEST_SHARE:
+            return None
+        return frozen(se2.compose(self._T_odom_base, se2.exp(share * self._motion)))
+
     def _goes_on(self, elapsed_s: float) -> bool:
         """Whether the motion in the last sweep tells that in the next one, ``elapsed_s`` later."""
         return self._sweep is not None and 0.0 < elapsed_s <= LARGEST_SHARE * self._sweep.duration_s
@@ -149,8 +156,8 @@ class PredictedMotion:
         return self._prediction.predict(scan)
 
     def place_image(self, image: CameraImage) -> CameraImage:
-        """An image without a pose: the robot is taken to be where the last scan was made."""
-        return replace(image, T_odom_base=None)
+        """An image with the pose to which the motion of the last scans goes on; None if they do not tell it."""
+        return replace(image, T_odom_base=self._prediction.at(image.stamp))
 
     def awaits_second(self, scan: LaserScan) -> bool:
         """Whether only a second scan shows the motion during this one."""
