@@ -163,9 +163,9 @@ def timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
     known = np.isfinite(times)
     if not known.any():
         return cloud
-    half = np.count_nonzero(known) // 2
-    after = (times - np.sort(times[known])[half]).astype(np.float64)
-    ordered = np.sort(after[known])
+    ordered = np.sort(times[known])
+    half = len(ordered) // 2
+    after, ordered = ((each - ordered[half]).astype(np.float64) for each in (times, ordered))
     low, high = np.quantile(ordered, (0.25, 0.75)).tolist()
     widths = ordered[half:] - ordered[: len(ordered) - half]
     shortest = int(np.argmin(widths))
