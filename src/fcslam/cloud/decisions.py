@@ -186,10 +186,12 @@ class ClosureDecisions(Kept):
 
     def _compared(self, pair: frozenset[str], evidence: ClusterEvidence, fusion: Fusion) -> ClusterEvidence:
         """The evidence of a join with the fit of both maps, which was not needed if other joins decided."""
-        if evidence.fit is not None:
+        if evidence.fit is not None and evidence.fit.seen_m:
             return evidence
         a, b = sorted(pair, key=self._sessions.robots.index)
-        return replace(evidence, fit=self.comparison.at((a, b), fusion.T_map_base[a], fusion.T_map_base[b]))
+        joint = (a, b), fusion.T_map_base[a], fusion.T_map_base[b]
+        fit = evidence.fit or self.comparison.at(*joint)
+        return replace(evidence, fit=replace(fit, seen_m=self.comparison.seen_m(*joint)))
 
     def _mark(self, entry: ClosureEntry) -> bool:
         """Note whether users exclude or pin the closure; returns whether that is new."""

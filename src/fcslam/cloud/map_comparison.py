@@ -147,6 +147,23 @@ class MapComparison(Kept):
         same = np.broadcast_to(group.identity, poses_b.shape)
         return replace(fit, seen_through=self._space.seen_through(sessions, poses_a, poses_b, same))
 
+    def seen_m(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> float:
+        """As in ``MapFit``, at poses (N, P) in the frame of one map, around where the paths come nearest."""
+        from scipy.spatial import cKDTree
+
+        from fcslam.lidar.uniqueness import align_map
+
+        poses = group_of(poses_a).to_plane(poses_a), group_of(poses_b).to_plane(poses_b)
+        local_maps = self._local_maps(sessions, *poses)
+        apart_m, _ = cKDTree(poses[0][:, :2]).query(poses[1][:, :2])
+        middle = poses[1][np.argmin(apart_m), :2]
+        near = [local_maps.around(side, middle)[:2] for side in (0, 1)]
+        if not all(keyscans for keyscans, _ in near):
+            return 0.0
+        (near_a, i), (near_b, j) = near
+        whole_a, whole_b = local_maps.whole(0, near_a, i.number), local_maps.whole(1, near_b, j.number)
+        return align_map(whole_a, whole_b, se2.between(poses[0][i.number], poses[1][j.number])).known_m
+
     def _local_maps(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> LocalMaps:
         a, b = (SeenKeyscans(self._sessions.keyscans(name), self._sessions.lasers(name)) for name in sessions)
         return LocalMaps((a, b), (poses_a, poses_b), (AGREES_M, AGREES_RAD))
@@ -154,7 +171,7 @@ class MapComparison(Kept):
 
 def _fit(agreement: PlaceAgreement) -> MapFit:
     support, expected, compared_m, contradicting_m = agreement
-    return MapFit(support, expected, -np.inf, compared_m, contradicting_m, 0.5 * compared_m)
+    return MapFit(support, expected, -np.inf, compared_m, contradicting_m)
 
 
 def _between(T_a_i: FloatArray, T_a_b: FloatArray, T_b_j: FloatArray) -> FloatArray:

@@ -83,7 +83,7 @@ class MapFit:
     contradicting_m: float = 0.0
     """Those in the other's free space, metres."""
     seen_m: float = 0.0
-    """Wall of one map in known area of the other, metres: of both maps, the one with less."""
+    """Wall of one map in known area of the other, metres: of both maps, the one with less. 0: it was not measured."""
     seen_through: float = 0.0
     """Share of the surfaces in space that the other robot saw through, less its standard error; 0: none is known."""
 
