@@ -7,7 +7,7 @@
   scan is kept.
 """
 
-from math import hypot, inf, remainder, tau
+from math import hypot, inf, isnan, remainder, tau
 
 import numpy as np
 
@@ -56,7 +56,7 @@ class ScanWatch:
             return
         if not count_returns(scan.ranges_m, scan.laser.max_range_m):
             self._audit.add(Fault.NO_RETURN, number)
-        if np.isnan(scan.T_odom_base).any():
+        if any(map(isnan, scan.T_odom_base.tolist())):
             return
         rest = self._at_rest.get(scan.laser.T_base_laser)
         if rest is None or rest.laser != scan.laser or not stands_still(rest, scan):

@@ -71,6 +71,8 @@ class CarmenArrays:
         """Of the scans and the readings, seconds."""
         self.untimed = set[int]()
         """Scans whose stamps the log does not state."""
+        self.invalid: dict[int, int] = {}
+        """Scans with invalid ranges, and how many."""
         self.stated: list[LaserModel | None] = []
         """The laser that the line of each scan states, without its mounting."""
         self.parameters: dict[str, str] = {}
@@ -148,15 +150,16 @@ class CarmenArrays:
         """Add a scan; the log states no ``stamp`` if it is None."""
         if len(ranges_m) == 0:
             raise ValueError("not as many ranges as stated")
+        self._poses.extend(_pose_of(poses[:3]) + _pose_of(poses[3:]))
+        scan = len(self.stamps)
         if not (ranges_m.min() >= 0.0 and ranges_m.max() < _LONGEST_RANGE_M):
             is_range = (ranges_m >= 0.0) & np.isfinite(ranges_m)
+            self.invalid[scan] = int(np.count_nonzero(~is_range))
             ranges_m = np.where(is_range, np.minimum(ranges_m, _LONGEST_RANGE_M), nan)
-        self._poses.extend(_pose_of(poses[:3]) + _pose_of(poses[3:]))
         self._ranges_m.frombytes(ranges_m.astype(np.float32).tobytes())
         self._ends.append(len(self._ranges_m))
         self.stated.append(stated)
         self.stamps.append(len(self.untimed) * UNTIMED_STEP_S if stamp is None else stamp)
-        scan = len(self.stamps) - 1
         if stamp is None:
             self.untimed.add(scan)
         return scan

@@ -12,8 +12,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from fcslam.errors import SourceError
 from fcslam.records import Beams, FloatArray, LaserScan, Odometry, SensorRecord, frozen
 from fcslam.sources.contradictions import ScanWatch
@@ -72,7 +70,7 @@ class CarmenLog:
                     yield Odometry(log.odometry_stamps[~k], T_odom_base)
                 continue
             ranges_m = log.ranges_m[k]
-            if invalid := int(np.count_nonzero(np.isnan(ranges_m))):
+            if invalid := log.invalid.get(k):
                 audit.add(Fault.INVALID_RANGE, number, invalid)
             beams = log.beams_of(k, laser.beams)
             assert beams is not None  # as the gate says
