@@ -11,9 +11,10 @@ Floors: the maps of `real_floors.py`, each of one robot or of two that were on o
 good scanner (12 m far, noise of 0.015 m) or a short one (4 m, 0.04 m), one with a medium (5 m, 0.03 m) or a weak one
 (3 m, 0.06 m). Maps of the short and the weak scanner are bad nearly everywhere.
 
-Leaving out: for each building, `QUANTILE` is chosen by the maps of all other buildings as the conformal quantile of
+Leaving out: for each building, `QUANTILE` is chosen by the maps of all other buildings. "Conformal" is the quantile of
 95 % of the ratio between the 95 % error of a map and its expected one. Held: maps of the building whose 95 % error is
-below the bound. Three years of one floor, or the floors of one building, are one building.
+below the bound. "Balanced" is the factor at which the worse of two shares is best: good cells called good, over 95 %,
+and bad cells called bad, over 80 %. Three years of one floor, or the floors of one building, are one building.
 """
 
 import json
@@ -48,8 +49,8 @@ SCANNERS = (
 )
 COLUMNS = {"": "", "maps": ",d", "good cells": ",d", "called good, %": ".1f", "bad cells": ",d",
            "called bad, %": ".1f", "of those called good, good, %": ".1f", "within the bound, %": ".1f"}  # fmt: skip
-LEFT_OUT = {"building": "", "maps": ",d", "quantile of the others": ".2f", "maps held, %": ".0f",
-            "good called good, %": ".1f", "bad called bad, %": ".1f"}  # fmt: skip
+LEFT_OUT = {"building": "", "maps": ",d", "conformal": ".2f", "maps held, %": ".0f", "good, %": ".1f",
+            "bad, %": ".1f", "balanced": ".2f", "good called good, %": ".1f", "bad called bad, %": ".1f"}  # fmt: skip
 
 
 class Simulated:
@@ -177,17 +178,26 @@ def rows(maps: list[JudgedMap], title: str) -> list[tuple]:
 
 
 def left_out(maps: list[JudgedMap]) -> Iterator[tuple]:
-    held, every = [], []
+    held, rescaled = [], ([], [])
     for building in dict.fromkeys(one.building for one in maps):
-        mine = [one for one in maps if one.building == building]
-        ratios = np.sort([one.ratio for one in maps if one.building != building])
-        quantile = float(ratios[min(len(ratios), int(np.ceil(0.95 * (len(ratios) + 1)))) - 1])
-        held += [one.ratio <= quantile for one in mine]
-        every += [one._replace(bound_m=quantile / QUANTILE * one.bound_m) for one in mine]
-        _, _, _, good, _, bad, *_ = row("", mine, quantile / QUANTILE)
-        yield building, len(mine), quantile, 100.0 * float(np.mean(held[-len(mine) :])), good, bad
-    _, _, _, good, _, bad, *_ = row("", every)
-    yield "all", len(maps), float("nan"), 100.0 * float(np.mean(held)), good, bad
+        mine, others = ([one for one in maps if (one.building == building) == inside] for inside in (True, False))
+        ratios = np.sort([one.ratio for one in others])
+        conformal = float(ratios[min(len(ratios), int(np.ceil(0.95 * (len(ratios) + 1)))) - 1]) / QUANTILE
+        factors = conformal, max(np.arange(0.2, 3.0, 0.02), key=lambda factor: balance(others, factor))
+        held += [one.ratio <= QUANTILE * conformal for one in mine]
+        for every, factor in zip(rescaled, factors, strict=True):
+            every += [one._replace(bound_m=factor * one.bound_m) for one in mine]
+        shares = [row("", mine, factor)[3:6:2] for factor in factors]
+        yield (building, len(mine), QUANTILE * factors[0], 100.0 * float(np.mean(held[-len(mine) :])), *shares[0],
+               QUANTILE * factors[1], *shares[1])  # fmt: skip
+    shares = [row("", every)[3:6:2] for every in rescaled]
+    yield "all", len(maps), float("nan"), 100.0 * float(np.mean(held)), *shares[0], float("nan"), *shares[1]
+
+
+def balance(maps: list[JudgedMap], factor: float) -> float:
+    """The worse of two shares: good cells called good beyond 95 %, bad ones called bad beyond 80 %."""
+    good, bad = row("", maps, factor)[3:6:2]
+    return float(np.nanmin([(good - 95.0) / 5.0, (bad - 80.0) / 20.0]))
 
 
 def percent(values: FloatArray) -> float:

@@ -451,6 +451,9 @@ def test_the_page_fits_a_phone(browser, mapped):
         for name in ("fleet", "map"):
             view(phone, name)
             assert covered_controls(phone) == []
+            if name == "fleet":
+                verdict, drawn = (phone.locator(part).bounding_box() for part in ("#verdicts", "#map"))
+                assert verdict["y"] < drawn["y"], "the verdict comes first"
         box = phone.locator("#map").bounding_box()
         assert box["width"] == 390
         assert box["height"] > 300

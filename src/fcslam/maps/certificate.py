@@ -24,9 +24,9 @@ from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray
 
 QUIET: Final = 0.1
-"""Ratio of true errors to the standard deviations of the graph if its edges leave no residuals. It grows by their root
-mean square: 1 if the measurements scatter as the graph expects."""
-QUANTILE: Final = 3.0
+"""Ratio of true errors to the standard deviations of the graph where its edges leave no residuals. Their root mean
+square, 1 if the measurements scatter as the graph expects, is added in quadrature."""
+QUANTILE: Final = 4.3
 """Ratio of the error that 95 % of the cells of a map stay below to the expected one, in most maps."""
 WITHIN_M: Final = 10.0
 CELL_M: Final = 1.0
@@ -34,10 +34,10 @@ MOST_PLACES: Final = 600
 """Places whose covariances are computed; of a larger map they lie farther apart."""
 FEWEST_NEAR: Final = 5
 """Places around a place, at least; farther ones count if there are fewer."""
+FEWEST_REDUNDANT: Final = 10
+"""Redundant measurements by which residuals are divided, at least: few do not show how measurements scatter."""
 LEAST_GAIN_M2: Final = 10
-"""Area that another drive makes good, at least."""
-OPEN_M2: Final = 10.0
-"""Unknown area beyond the edge of the map where it counts as open."""
+"""Area that another drive makes good, or that is unknown beyond an open edge of the map, at least."""
 UNKNOWN_INFORMATION: Final = 1e-4
 """Information about the pose of keyscans that no edge connects with the first one."""
 _S: Final = np.array(((0.0, -1.0), (1.0, 0.0)))
@@ -63,11 +63,11 @@ class Places(NamedTuple):
     poses: FloatArray
     """Shape (P, 3)."""
     covariance: FloatArray
-    """Covariance of the errors (x, y, theta) along the axes of ``map``, (3 P, 3 P), calibrated."""
-    scale: float
-    """Ratio of errors to the standard deviations of the graph."""
+    """Covariance of the errors (x, y, theta) along the axes of ``map``, by the graph, (3 P, 3 P)."""
+    scale: FloatArray
+    """Ratio of errors to the standard deviations of the graph, around each place, (P,)."""
     drift: FloatArray
-    """Covariance that a drive of one metre adds near each place, calibrated, along the axes of ``map``, (P, 3, 3)."""
+    """Covariance that a drive of one metre adds near each place, by the graph, along the axes of ``map``, (P, 3, 3)."""
 
     def bend_m(self, within_m: float, wanted: NDArray[np.int64] | None = None) -> FloatArray:
         """Root mean square error of the positions around each place after the best rigid alignment, shape (P,).
@@ -88,7 +88,7 @@ class Places(NamedTuple):
             around = self.covariance[np.ix_(rows, rows)]
             rigid = (motions * (around @ motions)).sum()
             result[k] = math.sqrt(max(0.0, float(np.trace(around) - rigid)) / len(near))
-        return result
+        return self.scale * result
 
 
 def certify(
@@ -96,19 +96,18 @@ def certify(
     paths: Sequence[MappedPath],
     occupancy: OccupancyMap,
     bar_m: float | None = None,
-    within_m: float = WITHIN_M,
     robot_radius_m: float = 0.0,
 ) -> dict[str, Any]:
     """The certificate of one map, as ``quality.json`` has it; lengths in metres.
 
     ``paths`` are the sessions of the map, at least one keyscan in all; the first one begins its frame. A cell is good
-    if the bound of the error around it, within ``within_m``, is at most ``bar_m``, by default a cell of the map.
+    if the bound of the error within ``WITHIN_M`` around it is at most ``bar_m``, by default a cell of the map.
     """
     bar_m = occupancy.resolution_m if bar_m is None else bar_m
     places = covariances(graph, paths)
     centres = _known_squares(occupancy)
     nearest = np.array([np.argmin(_distances(places.poses, centre)) for centre in centres], np.int64)
-    bound = QUANTILE * places.bend_m(within_m)
+    bound = QUANTILE * places.bend_m(WITHIN_M)
     is_good = bound <= bar_m
     cells = [
         {"x": round(x, 3), "y": round(y, 3), "bound_95": round(float(bound[k]), 4), "good": bool(is_good[k])}
@@ -117,16 +116,15 @@ def certify(
     ends = np.array([path.T_map_base[-1, :2] for path in paths if len(path.T_map_base)])
     return {
         "bar": bar_m,
-        "within": within_m,
+        "within": WITHIN_M,
         "cell": CELL_M,
-        "scale": round(places.scale, 4),
         "error_95": round(float(np.percentile(bound[nearest], 95)), 4) if cells else None,
         "good_share": round(float(is_good[nearest].mean()), 4) if cells else None,
-        "drives": _drives(places, nearest, is_good, bar_m, within_m),
+        "drives": _drives(places, nearest, is_good, bar_m),
         "open_ends": [
             {"x": round(one.point[0], 2), "y": round(one.point[1], 2), "gain_m2": round(one.gain_m2, 1)}
             for one in frontiers(occupancy, ends, robot_radius_m, with_paths=False)
-            if one.gain_m2 >= OPEN_M2
+            if one.gain_m2 >= LEAST_GAIN_M2
         ],
         "cells": cells,
     }
@@ -145,9 +143,8 @@ def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
     in_bases = marginal_covariance(structure, jacobians, part.information, held, chosen).reshape(len(chosen), 3, -1, 3)
     turn = se2.adjoint(poses[chosen] * (0.0, 0.0, 1.0))
     covariance = np.einsum("pab,pbqc,qdc->paqd", turn, in_bases, turn, optimize=True).reshape(3 * len(chosen), -1)
-    scale = QUIET + _contradiction(graph, rows, len(variables))
-    drift = _drift(part, poses, chosen)
-    return Places(variables[chosen], poses[chosen], covariance * scale**2, scale, drift * scale**2)
+    scale = np.hypot(QUIET, _contradiction(graph, rows, poses, chosen))
+    return Places(variables[chosen], poses[chosen], covariance, scale, _drift(part, poses, chosen))
 
 
 def _drift(edges: EdgeArrays, poses: FloatArray, chosen: NDArray[np.int64]) -> FloatArray:
@@ -166,12 +163,19 @@ def _drift(edges: EdgeArrays, poses: FloatArray, chosen: NDArray[np.int64]) -> F
     return np.asarray(near @ added.reshape(-1, 9) / near.sum(axis=1, keepdims=True)).reshape(-1, 3, 3)
 
 
-def _contradiction(graph: PoseGraph, rows: NDArray[np.int64], variables: int) -> float:
-    """Root mean square residual of the edges of one map, in standard deviations, for each redundant measurement."""
+def _contradiction(
+    graph: PoseGraph, rows: NDArray[np.int64], poses: FloatArray, chosen: NDArray[np.int64]
+) -> FloatArray:
+    """Root mean square residual of the edges around the chosen poses, in standard deviations, shape (P,).
+
+    It is for each redundant measurement of one map within ``WITHIN_M``.
+    """
     edges = graph.arrays()
     inside = np.flatnonzero((rows[edges.i] >= 0) & (rows[edges.j] >= 0))
-    redundant = len(inside) - (variables - 1)
-    return math.sqrt(float(graph.chi2(rows=inside).sum()) / (3.0 * redundant)) if redundant > 0 else 0.0
+    near = np.array([_distances(poses, place) <= WITHIN_M for place in poses[chosen]])
+    of_edges = near[:, rows[edges.i[inside]]]
+    redundant = np.maximum(of_edges.sum(axis=1) - near.sum(axis=1), FEWEST_REDUNDANT)
+    return np.asarray(np.sqrt(of_edges @ graph.chi2(rows=inside) / (3.0 * redundant)))
 
 
 def _part(graph: PoseGraph, poses: FloatArray, rows: NDArray[np.int64]) -> PoseGraph:
@@ -212,20 +216,20 @@ def _distances(poses: FloatArray, place: FloatArray) -> FloatArray:
 
 
 def _drives(
-    places: Places, nearest: NDArray[np.int64], is_good: NDArray[np.bool_], bar_m: float, within_m: float
+    places: Places, nearest: NDArray[np.int64], is_good: NDArray[np.bool_], bar_m: float
 ) -> list[dict[str, Any]]:
     """What to drive again, the drive with the largest gain first; none if nothing helps."""
     weight = np.bincount(nearest, minlength=len(places.poses))
     bad = np.flatnonzero(~is_good & (weight > 0))
     known = np.flatnonzero(is_good) if is_good.any() else np.array([0])
     found: list[dict[str, Any]] = []
-    error = places.bend_m(within_m, bad)
+    error = places.bend_m(WITHIN_M, bad)
     for b in bad[np.argsort(-error[bad])][:: max(1, len(bad) // 8)].tolist()[:8]:
         apart = np.hypot(*(places.poses[known, :2] - places.poses[b, :2]).T)
         a = int(known[np.argmin(np.where(known == b, np.inf, apart))])
         if a == b:
             continue
-        after = places._replace(covariance=_with_motion(places, a, b)).bend_m(within_m, bad)
+        after = places._replace(covariance=_with_motion(places, a, b)).bend_m(WITHIN_M, bad)
         gain = int(weight[bad[QUANTILE * after[bad] <= bar_m]].sum())
         if gain >= LEAST_GAIN_M2:
             ends = [[round(float(value), 1) for value in places.poses[k, :2]] for k in (a, b)]
