@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -80,7 +80,7 @@ def draw_on_device(
         sides = len(parts[0]) // count  # 2 where there is a row for each view
         return torch.cat([part for view in zip(*(part.chunk(sides) for part in parts), strict=True) for part in view])
 
-    return TrainingBatch(**{each.name: joined(each.name) for each in fields(TrainingBatch)})
+    return TrainingBatch(**{each: joined(each) for each in TrainingBatch._fields})
 
 
 def _draw(
