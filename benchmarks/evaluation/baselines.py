@@ -109,6 +109,6 @@ def moved_to_corners(image: GreyImage, positions_px: NDArray[np.float32]) -> NDA
     if not len(positions_px):
         return positions_px
     limits = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
-    start = np.array(positions_px, np.float32)[:, None]
+    start = np.array(positions_px, np.float32, order="C").reshape(-1, 1, 2)
     moved = cv2.cornerSubPix(image, start, (_WINDOW_PX, _WINDOW_PX), (-1, -1), limits)
     return np.asarray(moved[:, 0], np.float32)
