@@ -19,13 +19,7 @@ from fcslam.places.similarity import similarity
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
 from fcslam.records import Codes, FloatArray
 
-from .place_features import (
-    BRUTE_FORCE,
-    FOREIGN_TREE,
-    DescribedSet,
-    PretrainedVocabulary,
-    matching_descriptors,
-)
+from .place_features import BRUTE_FORCE, DescribedSet, matching_descriptors
 
 BATCH: Final = 40
 """Places of a batch."""
@@ -68,8 +62,6 @@ class Growth:
     """Number of words, shape (U,); NaN without a vocabulary."""
     seconds: FloatArray
     """CPU time to add the batch, shape (U,), seconds; NaN without an index."""
-    asked: FloatArray
-    """Similarities by the index's default scoring at the end, shape (G, 1 + W); empty without an index."""
 
     def measures(self, update: int) -> dict[str, FloatArray]:
         """``MEASURES`` of every group after a batch, each of shape (G,)."""
@@ -156,11 +148,16 @@ def grow_vocabulary(
         for g, group in enumerate(groups):
             target = index.bag(group.target)
             similarities[update, g] = [similarity(target, index.bag(other)) for other in group.others]
-    asked = np.zeros((len(groups), 1 + DISTRACTORS))
-    for g, group in enumerate(groups):
-        answer = index.compare(group.target)
-        asked[g] = [answer.similarity_of(name) for name in group.names]
-    return Growth(_counts(updates), similarities, words, seconds, asked)
+    return Growth(_counts(updates), similarities, words, seconds)
+
+
+def last_seconds(config: VocabularyConfig, arrivals: Sequence[Arrival], seed: int) -> float:
+    """CPU time in which an index takes in the last ``BATCH`` places."""
+    index: PlaceIndex[str] = PlaceIndex(config, np.random.default_rng(seed))
+    _compile(index, arrivals[0].descriptors)
+    for place in arrivals[:-BATCH]:
+        index.add(place.name, place.descriptors)
+    return sum(_timed_add(index, place) for place in arrivals[-BATCH:])
 
 
 def _compile(like: PlaceIndex[str], descriptors: Codes) -> None:
@@ -176,25 +173,15 @@ def _timed_add(index: PlaceIndex[str], place: Arrival) -> float:
     return time.thread_time() - began
 
 
-def fixed_growths(
-    arrivals: Sequence[Arrival], groups: Sequence[ProbeGroup], training: Sequence[Codes], seed: int
-) -> dict[str, Growth]:
-    """Results of scorers that do not change: brute force, and a pretrained vocabulary if there are training images."""
-    updates = len(arrivals) // BATCH
+def fixed_growths(arrivals: Sequence[Arrival], groups: Sequence[ProbeGroup]) -> dict[str, Growth]:
+    """Results of brute force, which does not change."""
     brute = [[matching_descriptors(g.target, other) / max(1, len(g.target)) for other in g.others] for g in groups]
-    fixed = {BRUTE_FORCE: _fixed(np.array(brute), updates, np.nan)}
-    if training:
-        tree = PretrainedVocabulary(training, seed)
-        scores = [[similarity(tree.bag(g.target), tree.bag(other)) for other in g.others] for g in groups]
-        fixed[FOREIGN_TREE] = _fixed(np.array(scores), updates, float(tree.word_count))
-    return fixed
+    return {BRUTE_FORCE: _fixed(np.array(brute), len(arrivals) // BATCH, np.nan)}
 
 
 def _fixed(similarities: FloatArray, updates: int, words: float) -> Growth:
     repeated = np.repeat(similarities[None], updates, axis=0)
-    return Growth(
-        _counts(updates), repeated, np.full(updates, words), np.full(updates, np.nan), np.empty((0, 1 + DISTRACTORS))
-    )
+    return Growth(_counts(updates), repeated, np.full(updates, words), np.full(updates, np.nan))
 
 
 def _counts(updates: int) -> FloatArray:
