@@ -70,10 +70,8 @@ def test_choices_and_faults_are_said(tmp_path, capsys):
 # Names
 
 
-def test_names_tell_equal_files_apart(tmp_path, bag, refused):
+def test_names_tell_equal_files_apart(tmp_path, bag):
     twin = save(tmp_path / "run1.mcap", drive(15))
-    assert "NAME=LOG" in refused("map", bag, twin, "-o", tmp_path / "out")
-    assert "so they are copies" in refused("map", bag, f"ben={bag}", "-o", tmp_path / "out")
     assert run("map", f"anna={bag}", f"ben={twin}", "-o", tmp_path / "out") == 0
     assert robots(tmp_path / "out") == {"anna": 40, "ben": 15}
 
@@ -132,8 +130,6 @@ def test_only_force_replaces(tmp_path, bag, refused, name):
 
 
 def test_what_convert_refuses(tmp_path, bag, refused):
-    for name in ("a.zip", "a.clf"):
-        assert f"{name}: not a kind of bag" in refused("record", bag, "-o", tmp_path / name)
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "main.tex").touch()
     assert "not a recording" in refused("record", bag, "-o", tmp_path / "thesis", "--force")
@@ -141,4 +137,3 @@ def test_what_convert_refuses(tmp_path, bag, refused):
     (tmp_path / "dir.bag").mkdir()
     assert "is a folder" in refused("record", bag, "-o", tmp_path / "dir.bag", "--force")
     assert "cannot be written" in refused("record", bag, "-o", bag / "a.mcap")
-    assert "no such file" in refused("record", tmp_path / "none.bag", "-o", tmp_path / "a.mcap")

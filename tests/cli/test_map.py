@@ -138,15 +138,6 @@ def test_a_recording_of_one_scan_is_a_run(tmp_path):
     assert maps_of(tmp_path / "run") == {"one": 0}
 
 
-def test_a_run_is_only_replaced_with_force(tmp_path, log, refused):
-    run = tmp_path / "run"
-    assert run_map(log, "--output", run) == 0
-    before = (run / "metrics.json").stat().st_mtime_ns
-    assert "--force" in refused("map", log, "--output", run)
-    assert "no such file" in refused("map", tmp_path / "none.log", "--output", run, "--force")
-    assert (run / "metrics.json").stat().st_mtime_ns == before
-
-
 def test_the_preset_of_the_paper_goes_under_the_configuration_file(tmp_path, log, refused):
     run, file = tmp_path / "run", tmp_path / "own.yaml"
     file.write_text("fleet: {matcher: {delta: 1.5}}")

@@ -111,19 +111,6 @@ def test_what_is_wrong_is_one_line(log, cloud, tmp_path, refused, arguments, rea
     assert cloud.cloud.stored == {}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        (["localize", "ros2:/robot1", "--map", "no", "--server", "http://127.0.0.1:9"], "no holds no earlier copy"),
-        (["localize", "ros2:/robot1", "--map", "no", "--server", "cloud"], "'cloud' is not the address of a cloud"),
-        (["localize", "ros2:/robot1", "--map", "no", "--initial-pose", "1,2"], "--initial-pose '1,2' is not a pose"),
-        (["localize", "ros2:/robot1", "--map", "no", "--update"], "record the drive, and localize the recording"),
-    ],
-)
-def test_what_a_robot_cannot_use_is_one_line(refused, arguments, reason):
-    assert reason in refused(*arguments)
-
-
 def test_a_cloud_that_turns_the_robot_away_is_one_line(log, cloud, tmp_path, refused):
     cloud.canned.append((401, {}, b'{"error": "no token"}'))
     assert f"fcslam: {cloud.url}: no token (401)" in refused("play", log, "--server", cloud.url, "--state", tmp_path)

@@ -43,6 +43,7 @@ WRONG = [
     ("info ros2:/r", "is a live robot, not a recording; `fcslam robot ros2:/r` maps it", ""),
     ("robot r.bag", "`fcslam play` plays a recording to a service", ""),
     ("robot ros2:r", "give one as in ros2:/robot1", ""),
+    ("record ros2:/r -o day.bag", "a recording of a live robot is a .mcap file", ""),
     ("record r.log -o a.zip", "fcslam: a.zip: not a kind of bag; end it in .bag", "record r.log -o a.bag"),
     ("record r.log -o r.bag", "r.bag: exists; choose another name or give --force", "record r.log -o r.bag --force"),
     # Robots
@@ -125,6 +126,10 @@ WRONG = [
     ("localize r.log --map nowhere -o out", "nowhere: cannot be read as a map", "localize r.log --map run -o out"),
     ("localize run --map r.log -o out", "give a run folder", "localize r.log --map run -o out"),
     ("localize r.log --map run -o out --initial-pose 1,2", "is not a pose; give X,Y,THETA", ""),
+    ("localize ros2:/r --map no --initial-pose 1,2", "--initial-pose '1,2' is not a pose", ""),
+    ("localize ros2:/r --map no --update", "record the drive, and localize the recording", ""),
+    ("localize ros2:/r --map no --server http://127.0.0.1:9", "no holds no earlier copy", ""),
+    ("localize ros2:/r --map no --server cloud", "'cloud' is not the address of a cloud", ""),
     # Services
     ("play r.log --state state", "give --server, or map it here with `fcslam map`", "map r.log"),
     ("play ros2:/r --server {url} --state state", "`fcslam robot ros2:/r` maps it", ""),

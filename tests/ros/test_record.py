@@ -6,7 +6,6 @@ import threading
 import numpy as np
 import pytest
 
-from fcslam.cli import main
 from fcslam.errors import InputError
 from fcslam.ros.inbox import SILENCE_S, Inbox
 from fcslam.ros.node import await_sensors
@@ -112,21 +111,6 @@ def test_a_missing_middleware_is_told_with_the_command_that_installs_it(monkeypa
     with pytest.raises(InputError, match="install it: ") as caught:
         Ros2Network(0, {})
     assert str(caught.value).endswith(INSTALL)
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["robot", "robot.bag"], "robot.bag: is not the address of a live robot"),
-        (["record", "ros2:/a", "-o", "day.bag"], "a recording of a live robot is a .mcap file"),
-        (["robot", "ros2:a b"], "'a b' is not a namespace"),
-    ],
-)
-def test_wrong_arguments_are_one_line(words, said, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(words) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert said in line
 
 
 def test_a_recording_ends_although_messages_keep_coming(tmp_path):

@@ -268,14 +268,8 @@ def test_bad_truth_is_one_line_and_exit_code_2(folder, capsys, file, content, me
     assert error.count("\n") == 1
 
 
-def test_bad_folders_are_one_line_and_exit_code_2(folder, capsys, tmp_path):
-    RUN.save(folder)
-    for arguments, message in (([str(folder), "--csv", str(tmp_path / "missing" / "table.csv")], "cannot be written"),):
-        assert main(["evaluate", "fleet", *arguments]) == 2
-        error = capsys.readouterr().err
-        assert message in error
-        assert error.count("\n") == 1
-    Run({}).save(folder, force=True)
+def test_a_run_without_robots_is_refused(folder):
+    Run({}).save(folder)
     with pytest.raises(InputError, match="no robot"):
         evaluate_fleet(folder)
 
