@@ -20,16 +20,17 @@ from fcslam.features.classical import Orb
 from fcslam.features.codes import LARGEST_HAMMING, code_words, hamming_matrix, mutual_matches
 from fcslam.features.detector import FeatureDetector, ImageFeatures, OnnxConfig, OnnxDetector
 from fcslam.features.detector_kinds import DetectorKind
-from fcslam.features.files import extract, find_files, read_features, read_grey
+from fcslam.features.files import extract, find_files, read_grey
 from fcslam.lidar.lost import LostConfig
 from fcslam.places.index import PlaceIndex
 from fcslam.places.kmeans_tree import Tree, TreeShape, find_leaves, grow_tree
 from fcslam.places.motions import rigid_hypotheses
 from fcslam.places.similarity import BagOfWords
 from fcslam.places.vocabulary import Strategy, VocabularyConfig
-from fcslam.records import Channel, Codes, FloatArray, Keyscan, Place, frozen
+from fcslam.records import CODE_BYTES, Channel, Codes, FloatArray, Keyscan, Place, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source
+from fcslam.untrusted import read_arrays
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
 
@@ -37,6 +38,8 @@ from .matching import mutual_pairs
 from .place_sets import PlaceSet, all_images, read_place_set
 from .retrieval import PairTruth, excluding_recent
 
+EXTRACTED: Final = ("keypoints", "scores", "descriptors", "image_size")
+"""Arrays of a file that `fcslam tools extract`, or another program, writes for an image."""
 BRUTE_FORCE_BITS: Final = 48
 """Largest Hamming distance of matching descriptors."""
 BRUTE_FORCE, FOREIGN_TREE = "brute force", "foreign tree"
@@ -277,6 +280,33 @@ class FeatureChoice:
         folder = self.extracted or Path()
         path = folder / root.resolve().name / image.relative_to(root).with_suffix(".npz")
         return _places(read_features(path)[0].take(slice(FEATURES_PER_IMAGE)))
+
+
+def read_features(path: Path) -> tuple[ImageFeatures, tuple[int, int]]:
+    """Read features, the strongest first, and the width and height of their image in pixels.
+
+    Raises:
+        FeatureError: the file cannot be read, or is not of this format.
+    """
+    try:
+        archive = read_arrays(path)
+        keypoints, scores, descriptors, size = (archive[name] for name in EXTRACTED)
+    except (OSError, ValueError, KeyError) as error:
+        raise FeatureError(f"{path}: cannot read the features ({error}); write {', '.join(EXTRACTED)}") from error
+    count = len(scores) if scores.ndim == 1 else -1
+    shapes = (keypoints.shape, descriptors.shape, size.shape)
+    if shapes != ((count, 2), (count, CODE_BYTES), (2,)) or descriptors.dtype != np.uint8:
+        raise FeatureError(
+            f"{path}: keypoints {keypoints.shape}, scores {scores.shape}, descriptors {descriptors.shape} "
+            f"{descriptors.dtype}, image_size {size.shape}; expected (N, 2), (N,), (N, {CODE_BYTES}) uint8, (2,)"
+        )
+    if any(array.dtype.kind not in "fiu" or not np.isfinite(array).all() for array in (keypoints, scores, size)):
+        raise FeatureError(f"{path}: keypoints, scores and image_size must be finite numbers")
+    order = np.argsort(-scores.astype(np.float64), kind="stable")
+    features = ImageFeatures(
+        frozen(keypoints[order], np.float32), frozen(scores[order], np.float32), frozen(descriptors[order], np.uint8)
+    )
+    return features, (int(size[0]), int(size[1]))
 
 
 def choose_features(choice: str) -> FeatureChoice:

@@ -3,12 +3,13 @@
 import cv2
 import numpy as np
 import pytest
+from evaluation.place_features import read_features
 
 from fcslam.cli import main
 from fcslam.errors import FeatureError
 from fcslam.features.classical import Orb
 from fcslam.features.detector import NO_FEATURES
-from fcslam.features.files import extract, read_features, read_grey, write_features
+from fcslam.features.files import extract, read_grey, write_features
 from tests.features.networks import tiny_network
 from tests.features.pictures import picture
 from tests.lidar.worlds import room

@@ -1,4 +1,4 @@
-"""Reads image files, extracts the features of images, and writes and reads them, one ``.npz`` for each image.
+"""Reads image files, extracts the features of images, and writes them, one ``.npz`` for each image.
 
 Arrays: ``keypoints`` (N, 2) float32, x y in pixels of the image, (0, 0) the centre of its first pixel; ``scores`` (N,)
 float32; ``descriptors`` (N, 32) uint8, the bits packed; ``image_size`` (2,), width and height.
@@ -11,11 +11,9 @@ import numpy as np
 
 from fcslam.errors import FeatureError, writing
 from fcslam.features.detector import FeatureDetector, GreyImage, ImageFeatures, decode_grey, in_original, shrink
-from fcslam.records import CODE_BYTES, frozen
+from fcslam.records import frozen
 from fcslam.storage.files import replacing
-from fcslam.untrusted import Arrays, read_arrays, read_bytes
-
-_ARRAYS = ("keypoints", "scores", "descriptors", "image_size")
+from fcslam.untrusted import Arrays, read_bytes
 
 
 def read_grey(path: Path) -> GreyImage:
@@ -46,33 +44,6 @@ def write_features(path: Path, features: ImageFeatures, image_size: tuple[int, i
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as unfinished, unfinished.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
-
-
-def read_features(path: Path) -> tuple[ImageFeatures, tuple[int, int]]:
-    """Read features, the strongest first, and the width and height of their image in pixels.
-
-    Raises:
-        FeatureError: the file cannot be read, or is not of this format.
-    """
-    try:
-        archive = read_arrays(path)
-        keypoints, scores, descriptors, size = (archive[name] for name in _ARRAYS)
-    except (OSError, ValueError, KeyError) as error:
-        raise FeatureError(f"{path}: cannot read the features ({error}); write {', '.join(_ARRAYS)}") from error
-    count = len(scores) if scores.ndim == 1 else -1
-    shapes = (keypoints.shape, descriptors.shape, size.shape)
-    if shapes != ((count, 2), (count, CODE_BYTES), (2,)) or descriptors.dtype != np.uint8:
-        raise FeatureError(
-            f"{path}: keypoints {keypoints.shape}, scores {scores.shape}, descriptors {descriptors.shape} "
-            f"{descriptors.dtype}, image_size {size.shape}; expected (N, 2), (N,), (N, {CODE_BYTES}) uint8, (2,)"
-        )
-    if any(array.dtype.kind not in "fiu" or not np.isfinite(array).all() for array in (keypoints, scores, size)):
-        raise FeatureError(f"{path}: keypoints, scores and image_size must be finite numbers")
-    order = np.argsort(-scores.astype(np.float64), kind="stable")
-    features = ImageFeatures(
-        frozen(keypoints[order], np.float32), frozen(scores[order], np.float32), frozen(descriptors[order], np.uint8)
-    )
-    return features, (int(size[0]), int(size[1]))
 
 
 def find_files(images: Path) -> list[Path]:
