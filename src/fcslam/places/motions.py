@@ -23,15 +23,13 @@ SEEDS = 50
 """Closest matches that seed the search: every two of them propose a motion."""
 INLIER_M = 0.3
 """Largest distance between the matched keypoints of an inlier, metres."""
-MINIMUM_INLIERS = 4
-"""Fewest inliers of a motion hypothesis."""
+LEAST_INLIERS = 8
+"""Fewest inliers of a motion, which the submaps then verify."""
 MOST_HYPOTHESES = 2
 """Most motion hypotheses of a pair of places."""
 INDEPENDENT_KEYPOINTS: Final = 10
 """Most independent keypoints of one image. The errors of its keypoints are correlated, because they share one scan and
 one robot pose, so more keypoints do not add information."""
-LEAST_INLIERS = 8
-"""Fewest inliers of a motion that the submaps then verify."""
 LARGEST_LEVEL_M = 0.1
 """Largest difference in height of two matching image keypoints, metres."""
 KEYPOINT_SIGMA_M = 0.1
@@ -50,10 +48,10 @@ def rigid_hypotheses(
 
     Every two of the ``SEEDS`` closest matches propose a motion (two-point alignment). All matches score it, and least
     squares over the inliers refines the best. The search is deterministic and never proposes a reflection. There are at
-    most ``MOST_HYPOTHESES``, and none without ``MINIMUM_INLIERS``. Keypoints are in metres in their place's coordinate
+    most ``MOST_HYPOTHESES``, and none without ``LEAST_INLIERS``. Keypoints are in metres in their place's coordinate
     frame.
     """
-    if len(matches.pairs) < MINIMUM_INLIERS:
+    if len(matches.pairs) < LEAST_INLIERS:
         return []
     a = keypoints_a[matches.pairs[:, 0]].astype(np.float64)
     b = keypoints_b[matches.pairs[:, 1]].astype(np.float64)
@@ -122,7 +120,9 @@ def _best(a: FloatArray, b: FloatArray, seeds: NDArray[np.int64]) -> tuple[Float
             break
         scores[best] = 0.0
         pose, agrees, count = _refine(a, b, _pose(trials, best))
-        if count < MINIMUM_INLIERS or _near(pose, poses[:found]):
+        if count < LEAST_INLIERS:
+            break  # the others have less support
+        if _near(pose, poses[:found]):
             continue
         poses[found, 0], poses[found, 1], poses[found, 2] = pose
         assign(agreeing[found], agrees)
@@ -222,11 +222,7 @@ def propose_motions(a: Place, b: Place) -> list[Motion]:
         matches = level_matches(a.keypoints, b.keypoints, matches)
     proposed = rigid_hypotheses(a.keypoints[:, :2], b.keypoints[:, :2], matches)
     share = len(matches.pairs) / max(1, min(len(a.descriptors), len(b.descriptors)))
-    return [
-        Motion(T_a_b, _information(b, T_a_b, matches.pairs[inliers, 1]), share)
-        for T_a_b, inliers in proposed
-        if len(inliers) >= LEAST_INLIERS
-    ]
+    return [Motion(T_a_b, _information(b, T_a_b, matches.pairs[inliers, 1]), share) for T_a_b, inliers in proposed]
 
 
 def level_matches(a: NDArray[np.floating], b: NDArray[np.floating], matches: Matches) -> Matches:

@@ -24,7 +24,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.backend import FinishedSubmap, LidarBackend
 from fcslam.lidar.frontend import LidarConfig, MappedKeyscan, ScanPose
 from fcslam.places.index import PlaceIndex
-from fcslam.places.motions import LEAST_INLIERS, rigid_hypotheses
+from fcslam.places.motions import rigid_hypotheses
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.records import (
     PLACE_CHANNELS,
@@ -310,8 +310,7 @@ class OwnPlaces:
         """Motions ``T_a_b``, shape (3,), that enough keypoints of two stored submaps support, the best first."""
         (keypoints_a, descriptors_a), (keypoints_b, descriptors_b) = self.features(a), self.features(b)
         matches = mutual_matches(descriptors_a, descriptors_b, LARGEST_HAMMING)
-        proposed = rigid_hypotheses(keypoints_a, keypoints_b, matches)
-        return [T_a_b for T_a_b, inliers in proposed if len(inliers) >= LEAST_INLIERS]
+        return [T_a_b for T_a_b, _ in rigid_hypotheses(keypoints_a, keypoints_b, matches)]
 
 
 def essential(input: NewKeyscan) -> list[Body]:
