@@ -72,8 +72,9 @@ def fleet_rows(fleets: Path, seed: int) -> Iterator[tuple]:
     saved, preset = read_mission(run), load(MissionConfig, Preset.PAPER.file)
     matcher = preset.fleet.matcher.model_copy(update={"delta": min(DELTAS)})
     cloud = Cloud(preset.fleet.model_copy(update={"matcher": matcher}), preset.seed)
-    for sent in saved.in_order:
-        cloud.apply(sent.packet)
+    packets = [sent.packet for its in saved.packets.values() for sent in its]
+    for packet in sorted(packets, key=lambda packet: packet.order):
+        cloud.apply(packet)
     result = cloud.finalize()
     true = {each.robot: _truth(fleet / each.robot / "ground_truth.tum", each.stamps) for each in result.robots}
     for delta in DELTAS:

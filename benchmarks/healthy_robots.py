@@ -144,7 +144,6 @@ def said_about(source: Source, read: Source) -> list[str]:
     for _ in read.records():
         pass
     lines = [*read.survey().notes, *bodies_of(source)]
-    lines += read.faults.warnings
     plain = [re.sub(r"^\S+: ", "", line).removesuffix("; not corrected") for line in lines]
     return list(dict.fromkeys(plain))
 
