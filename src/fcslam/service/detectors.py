@@ -43,7 +43,8 @@ class DetectorStore:
 
     def announce(self, content: bytes) -> DetectorFile:
         """Add a network and announce it to the robots."""
-        with tempfile.TemporaryDirectory() as folder:
+        self._root.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=self._root) as folder:  # the file system of the store has room for it
             unchecked = Path(folder) / "network.onnx"
             unchecked.write_bytes(content)
             file = describe_detector_file(unchecked)  # without the lock: it loads the network
