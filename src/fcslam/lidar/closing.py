@@ -123,12 +123,16 @@ class LoopCloser:
         self._held: dict[int, Submap | bytes] = {}
         """The submaps that others are compared with, by index, in the order of their use; all but the last are packed.
         The oldest of a well-known area are forgotten."""
-        self.has_closures = False
-        """Whether any closure was accepted."""
+        self._accepted: list[tuple[int, int]] = []
+        """Earlier and later submap of each accepted closure."""
         self._fixed: list[tuple[int, int]] = []
-        """Earlier and later submap of each accepted closure that fixes every direction: the others leave the drift
-        along a corridor as it was."""
+        """Those that fix every direction: the others leave the drift along a corridor as it was."""
         self._pending: list[LocalClosure] = []
+
+    @property
+    def has_closures(self) -> bool:
+        """Whether any closure was accepted."""
+        return bool(self._accepted)
 
     def add(self, keyscan: int, travel_m: float, submap: Submap, anchors: FloatArray) -> list[LocalClosure]:
         """Compare the next submap, its anchor's number and the path length up to there with earlier ones.
@@ -144,23 +148,29 @@ class LoopCloser:
             if isinstance(held := self._held[index], Submap):
                 self._held[index] = submap_bytes(held)
         is_known = self._forget_surplus(anchors)
-        closures = np.array(self._fixed, dtype=np.int64).reshape(-1, 2)
-        paths: FloatArray = _shortest_paths(later, np.diff(self._travel), closures, CLOSURE_PATH_M)
-        candidates = self._candidates(later, anchors, paths)
-        found = [
-            closure
-            for earlier in candidates[: 1 if is_known else MOST_CANDIDATES]
-            if (closure := self._compare(earlier, later, anchors, paths[earlier])) is not None
-        ]
+        near, paths = self._paths(self._accepted), self._paths(self._fixed)
+        candidates = self._candidates(later, anchors, paths)[: 1 if is_known else MOST_CANDIDATES]
+        compared = (
+            self._compare(earlier, later, anchors, near[earlier])
+            or self._compare(earlier, later, anchors, paths[earlier])
+            for earlier in candidates
+        )
+        found = [closure for closure in compared if closure is not None]
         accepted = [c for c in found if (c.check.loose and c.drift_m <= NARROW_M) or self._is_conclusive(c)]
         unsure = [c for c in found if c not in accepted]
         if self._recognizer is not None:
             self._recognizer.store(keyscan, self._submap(later).surface.points)
             if not accepted:
-                compared = {c.earlier for c in found}
+                known = {c.earlier for c in found}
                 recognized = self._recognized(self._recognizer, later, anchors, paths)
-                unsure += [c for c in recognized if c.earlier not in compared]
+                unsure += [c for c in recognized if c.earlier not in known]
         return self._accept(accepted, unsure, anchors)
+
+    def _paths(self, closures: list[tuple[int, int]]) -> FloatArray:
+        """Length of the shortest path to each submap through the odometry and these closures, shape (S,), metres."""
+        edges = np.array(closures, dtype=np.int64).reshape(-1, 2)
+        paths: FloatArray = _shortest_paths(len(self._travel) - 1, np.diff(self._travel), edges, CLOSURE_PATH_M)
+        return paths
 
     def _submap(self, index: int) -> Submap:
         held = self._held.pop(index)
@@ -263,8 +273,8 @@ class LoopCloser:
         cluster = supported(self._pending, self._travel, anchors)
         accepted += cluster
         self._pending = [c for c in self._pending if c not in cluster]
+        self._accepted += [(c.earlier, c.later) for c in accepted]
         self._fixed += [(c.earlier, c.later) for c in accepted if c.check.informative]
-        self.has_closures |= bool(accepted)
         return accepted
 
     @staticmethod

@@ -50,7 +50,7 @@ class Gate:
 
 STRICT = Gate(explained=0.80, violation=0.05, count=150, overlap=0.25)
 """Gate of a closure that no estimate predicts."""
-LOOSE = Gate(explained=0.70, violation=0.10, count=150, overlap=0.25)
+LOOSE = Gate(explained=0.70, violation=0.10, count=250, overlap=0.25)
 """Gate of a closure that an estimate predicts."""
 PARTIAL = Gate(explained=0.65, violation=0.22, count=500, overlap=0.5)
 """Gate of a partially supported closure: much overlap, but bent submaps (outdoors, on a slope). It counts half in a
