@@ -8,6 +8,7 @@ earlier submaps and the motions to them.
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Protocol
 
 import numpy as np
@@ -150,12 +151,11 @@ class LoopCloser:
         is_known = self._forget_surplus(anchors)
         near, paths = self._paths(self._accepted), self._paths(self._fixed)
         candidates = self._candidates(later, anchors, paths)[: 1 if is_known else MOST_CANDIDATES]
-        compared = (
-            self._compare(earlier, later, anchors, near[earlier])
-            or self._compare(earlier, later, anchors, paths[earlier])
-            for earlier in candidates
-        )
-        found = [closure for closure in compared if closure is not None]
+        found: list[LocalClosure] = []
+        for earlier in candidates:
+            lengths_m = dict.fromkeys((near[earlier], paths[earlier]))  # mostly the same
+            compared = (self._compare(earlier, later, anchors, length_m) for length_m in lengths_m)
+            found += islice(filter(None, compared), 1)
         accepted = [c for c in found if (c.check.loose and c.drift_m <= NARROW_M) or self._is_conclusive(c)]
         unsure = [c for c in found if c not in accepted]
         if self._recognizer is not None:
