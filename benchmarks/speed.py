@@ -203,7 +203,7 @@ def until_first_scan(checkout: Path, log: Path, work: Path) -> float:
     """Seconds from the start of the process until the first scan is mapped, with an empty cache."""
     noted = work / "seconds"
     noted.unlink(missing_ok=True)
-    with tempfile.TemporaryDirectory() as cache:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as cache:  # a child may still compile into it
         environment = {**os.environ, "PYTHONPATH": str(checkout / "src"), "NUMBA_CACHE_DIR": cache}
         arguments = ["map", log, "--output", work / "first", "--force"]
         command = [sys.executable, "-c", FIRST_SCAN, time.time(), noted, *arguments]
