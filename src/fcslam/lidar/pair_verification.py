@@ -43,6 +43,7 @@ class Pair(NamedTuple):
     noise: Callable[[], float] = no_noise
     """As in ``judge``. Stays in this process: it needs the scans."""
     predicted: bool = False
+    """As in ``judge``."""
     loose: Gate = LOOSE
     """As in ``judge``."""
 
