@@ -80,11 +80,11 @@ class StoreError(InputError):
 class PacketError(FcslamError):
     """Received bytes are not a valid packet; the message says why."""
 
+    def __init__(self, message: str, index: int | None = None) -> None:
+        super().__init__(message)
+        self.index = index
+        """Index of the packet in its batch, if the packets before it are stored."""
+
 
 class PacketConflictError(PacketError):
     """A packet has the number of a different packet that is already stored."""
-
-    def __init__(self, message: str, index: int = 0) -> None:
-        super().__init__(message)
-        self.index = index
-        """Index of the packet in its batch."""

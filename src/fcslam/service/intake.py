@@ -11,7 +11,7 @@ from fcslam.cloud.edits import in_force, is_removed
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import replies
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
-from fcslam.errors import FcslamError, InputError, PacketError
+from fcslam.errors import FcslamError, InputError, PacketError, UnavailableError
 from fcslam.mission.mission_file import as_stored
 from fcslam.mission.mission_store import MissionStore, StoredPacket
 from fcslam.records import Channel, DetectorFile
@@ -32,22 +32,6 @@ PACKET_BYTES = 8 * 2**10
 """A larger packet counts as several in the rate, by its bytes when it is unpacked."""
 
 _log = logging.getLogger(__name__)
-
-
-class BusyError(FcslamError):
-    """The service cannot take the packets now; the robot sends them again later."""
-
-    def __init__(self, message: str, retry_after_s: float = 2.0) -> None:
-        super().__init__(message)
-        self.retry_after_s = retry_after_s
-
-
-class RefusedPacketError(FcslamError):
-    """A packet of a batch is refused; those before it are stored."""
-
-    def __init__(self, message: str, index: int) -> None:
-        super().__init__(message)
-        self.index = index
 
 
 class PlaneError(FcslamError):
@@ -174,12 +158,12 @@ class Intake:
             the session of its newest packet.
 
         Raises:
-            PacketError: the batch cannot be taken apart; nothing is stored.
-            RefusedPacketError: a packet of it is refused.
+            PacketError: the batch cannot be taken apart, and nothing is stored; or, with an index, a packet of it is
+                refused.
             PacketConflictError: another packet has the number of one of them; those before it are stored.
             InputError: another agent speaks for the robot.
             PlaneError: it sends poses in space, and the mission is in the plane; nothing is stored.
-            BusyError: it has to be sent again later.
+            UnavailableError: it has to be sent again later.
             StoreError: the disk is full; nothing is stored.
         """
         check_robot(robot)
@@ -242,7 +226,9 @@ class Intake:
             self._warned.add(robot)
             _log.warning("%s: %d packets were refused; at twice as many the mission takes no more of it", robot, count)
         if share > 1.0 and sends:
-            raise BusyError(f"{robot}: {count} packets were refused, so this mission takes no more of this robot", 60.0)
+            raise UnavailableError(
+                f"{robot}: {count} packets were refused, so this mission takes no more of this robot", 60.0
+            )
         return count
 
     def _limit_sessions(self, robot: str, epochs: Collection[int]) -> None:
@@ -263,12 +249,15 @@ class Intake:
                 self._released.popleft()
             waiting = queued.get(robot, 0) + self._released.count(robot)
         if waiting > self._most_waiting:
-            raise BusyError(f"{robot}: {waiting} packets have not taken effect yet; send these again later")
+            raise UnavailableError(
+                f"{robot}: {waiting} packets have not taken effect yet; send these again later", retry_after_s=2.0
+            )
         if early and self.waiting_count(robot) + len(early) > self._most_waiting:
             session = early[0].session
-            raise BusyError(
+            raise UnavailableError(
                 f"{robot}: over {self._most_waiting} packets wait for one before them; "
-                f"send packet {self._log.next_sequence(session)} of epoch {robot_and_epoch(session)[1]} first"
+                f"send packet {self._log.next_sequence(session)} of epoch {robot_and_epoch(session)[1]} first",
+                retry_after_s=2.0,
             )
 
     def _replies(self, robot: str, epochs: Sequence[int], known_correction: int) -> bytes:
@@ -284,12 +273,10 @@ class Intake:
 def _take_tokens(buckets: TokenBuckets, robot: str, cost: float, limit: str) -> None:
     wait_s = buckets.wait_s(robot, cost)
     if wait_s > 0.0:
-        raise BusyError(f"{robot}: over {limit} (fleet.claims); send the others in {wait_s:.0f} s", wait_s)
+        raise UnavailableError(f"{robot}: over {limit} (fleet.claims); send the others in {wait_s:.0f} s", wait_s)
 
 
-def _checked(
-    robot: str, batch: Sequence[bytes], in_plane: bool
-) -> tuple[list[StoredPacket], RefusedPacketError | None]:
+def _checked(robot: str, batch: Sequence[bytes], in_plane: bool) -> tuple[list[StoredPacket], PacketError | None]:
     """The packets to be stored: all, or those up to and with the first that is refused."""
     packets: list[StoredPacket] = []
     for index, data in enumerate(batch):
@@ -299,7 +286,7 @@ def _checked(
             number = read_number(data)
             if number is not None and number[0] == robot:
                 packets.append(StoredPacket(*number, 0.0, None, None, data, str(error)))
-            return packets, RefusedPacketError(str(error), index)
+            return packets, PacketError(str(error), index)
     return packets, None
 
 

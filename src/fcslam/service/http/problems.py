@@ -18,13 +18,13 @@ from fcslam.errors import (
     PacketConflictError,
     PacketError,
     StoreError,
+    UnavailableError,
 )
-from fcslam.service.intake import BusyError, PlaneError, RefusedPacketError
+from fcslam.service.intake import PlaneError
 from fcslam.service.missions import UnknownMissionError
 
 STATUS: dict[type[FcslamError], int] = {
-    BusyError: 429,
-    RefusedPacketError: 400,
+    UnavailableError: 429,
     PacketConflictError: 409,
     PacketError: 400,
     PlaneError: 403,
@@ -53,7 +53,7 @@ def add_handlers(app: FastAPI) -> None:
 def _on_fcslam_error(_: Request, error: Exception) -> JSONResponse:
     is_away = isinstance(error, StoreError) and error.is_away
     status = 503 if is_away else next((STATUS[kind] for kind in type(error).mro() if kind in STATUS), 500)
-    headers = {"Retry-After": str(math.ceil(error.retry_after_s))} if isinstance(error, BusyError) else None
+    headers = {"Retry-After": str(math.ceil(error.retry_after_s))} if isinstance(error, UnavailableError) else None
     index = getattr(error, "index", None)
     return problem(status, str(error), headers, **({} if index is None else {"index": index}))
 
