@@ -41,6 +41,7 @@ from fcslam.learning.federated.robot_learning import RobotLink, serve_requests
 from fcslam.learning.federated.rounds import RoundReport
 from fcslam.learning.federated.settings import FederatedSettings
 from fcslam.learning.federated.weights import Weights
+from fcslam.wire.keys import Server
 
 DETECTOR = common.REPOSITORY / "src/fcslam/features/networks/detector.onnx"
 PROCESSES = 4
@@ -201,7 +202,7 @@ def answer(name: str, missing: float, port: int) -> None:
     client = DrawnRobot(name, missing, stay_away)
     while True:
         try:
-            with closing(RobotLink(f"http://127.0.0.1:{port}", name)) as link:
+            with closing(RobotLink(Server(f"http://127.0.0.1:{port}"), name)) as link:
                 serve_requests(link, client, lambda _: None)
         except PowerLossError:
             time.sleep(DEADLINE_S + LATE_S)

@@ -74,7 +74,7 @@ if TYPE_CHECKING:  # the names of ``_LAZY``, for type checkers
     from fcslam.sources import Source as Source
     from fcslam.sources import Survey as Survey
     from fcslam.sources.point_clouds import CloudBand as CloudBand
-    from fcslam.wire.http_transport import Server as Server
+    from fcslam.wire.keys import Server as Server
 
 __version__ = "0.1.0"
 
@@ -96,7 +96,7 @@ _LAZY: Final = {
         "fcslam.runs": "ClosureRow Join LocalMap LocalizedPoses Metric RobotTrajectory Run open_run",
         "fcslam.sources": "BagOptions Fault FaultCount Faults ScanRange Source Survey",
         "fcslam.sources.point_clouds": "CloudBand",
-        "fcslam.wire.http_transport": "Server",
+        "fcslam.wire.keys": "Server",
     }.items()
     for name in names.split()
 }

@@ -31,7 +31,7 @@ from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.missions import FIRST
 from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.http_transport import HttpTransport
-from fcslam.wire.keys import Credentials
+from fcslam.wire.keys import Server
 from fcslam.wire.packets import decode, encode
 from tests.small_fleet import in_order
 
@@ -130,7 +130,7 @@ def test_an_encrypted_key_is_told_and_no_passphrase_asked_for(credentials, tmp_p
     assert "cloud.key" in line
     assert "encrypted" in line
     with pytest.raises(CloudError, match="encrypted"):
-        HttpTransport("https://cloud.test", "robot_1", "agent", Credentials(own=(credentials / "cloud.pem", sealed)))
+        HttpTransport(Server("https://cloud.test", certificate=(credentials / "cloud.pem", sealed)), "robot_1", "agent")
 
 
 class Service:

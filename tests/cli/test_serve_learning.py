@@ -8,7 +8,7 @@ from fcslam.cli.training_options import learning_plan
 from fcslam.errors import InputError
 from fcslam.records import Channel
 from fcslam.robot.frontend import RobotConfig
-from fcslam.wire.http_transport import Server
+from fcslam.wire.keys import Server
 
 
 @pytest.mark.parametrize(

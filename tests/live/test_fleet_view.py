@@ -11,7 +11,7 @@ from fcslam.errors import CloudError
 from fcslam.live.fleet_view import FleetView
 from fcslam.maps.joint_voxels import read_points
 from fcslam.wire.fleet_client import FleetClient
-from fcslam.wire.keys import Credentials
+from fcslam.wire.keys import Server
 from fcslam.wire.packets import encode
 from tests.cloud.space_fleet import sent
 from tests.service.http.desk import SCRIPT, A, B, Desk
@@ -25,7 +25,7 @@ def desk(tmp_path, scripted):
 
 
 def client(desk, robot):
-    return FleetClient(str(desk.client.base_url), Credentials(f"token of {robot}"))
+    return FleetClient(Server(str(desk.client.base_url), f"token of {robot}"))
 
 
 def view(desk, robot, pose=None, limit_kBps=None):
@@ -168,7 +168,7 @@ def test_a_robot_says_where_it_is_and_others_believe_what_it_can_have_driven(des
 
 def test_following_goes_on_through_an_outage(desk):
     desk.send("a", A)
-    both = FleetClient(f"http://127.0.0.1:9,{desk.client.base_url}", Credentials("token of a"))
+    both = FleetClient(Server(f"http://127.0.0.1:9,{desk.client.base_url}", "token of a"))
     with closing(FleetView(both, "a", lambda: None)) as fleet:
         fleet.start()
         until = time.monotonic() + 120.0

@@ -18,7 +18,7 @@ from fcslam.mission.driving import front_end_of
 from fcslam.records import Channel, CloudScan, LaserScan, Place
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.outbox import Outbox
-from fcslam.wire.http_transport import Server
+from fcslam.wire.keys import Server
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet

@@ -19,7 +19,7 @@ from fcslam.page.report import ShownRun
 from fcslam.page.routes import run_page
 from fcslam.runs import RobotTrajectory, Run
 from fcslam.wire.fleet_client import MapClient
-from fcslam.wire.http_transport import Server
+from fcslam.wire.keys import Server
 
 pytestmark = pytest.mark.slow
 

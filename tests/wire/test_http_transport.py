@@ -11,7 +11,7 @@ from fcslam.records import Channel
 from fcslam.service.credentials import make_credentials
 from fcslam.wire.batches import AGENT_HEADER, CORRECTION_HEADER, MEDIA_TYPE, read_batch
 from fcslam.wire.http_transport import HttpResponse, HttpTransport
-from fcslam.wire.keys import Credentials
+from fcslam.wire.keys import Server
 from fcslam.wire.messages import Acknowledgement
 from fcslam.wire.packets import decode, encode
 from tests.robot.fake_cloud import said
@@ -31,7 +31,7 @@ def cloud():
 
 @pytest.fixture
 def transport(cloud):
-    transport = HttpTransport(cloud.url + "/", "r 1+2", "ab" * 16, Credentials("secret"))
+    transport = HttpTransport(Server(cloud.url + "/", "secret"), "r 1+2", "ab" * 16)
     yield transport
     transport.close()
 
@@ -125,7 +125,7 @@ def test_a_reply_without_an_end_is_read_no_further_than_the_limit(cloud, transpo
 
 
 def test_where_an_instance_does_not_answer_the_next_one_is_asked_and_stays(cloud):
-    instances = HttpTransport(f"http://127.0.0.1:9, {cloud.url}", "r", "ab" * 16)
+    instances = HttpTransport(Server(f"http://127.0.0.1:9, {cloud.url}"), "r", "ab" * 16)
     with pytest.raises(UnavailableError, match=r"127\.0\.0\.1:9"):
         instances.state()  # the caller waits before it tries again
     instances.send(PACKETS, -1)
@@ -154,15 +154,15 @@ def test_a_network_comes_as_it_is(cloud, transport):
 )  # fmt: skip
 def test_an_address_must_be_one(url):
     with pytest.raises(CloudError, match="not the address of a cloud"):
-        HttpTransport(url, "r", "ab" * 16)
+        HttpTransport(Server(url), "r", "ab" * 16)
 
 
 def test_a_token_is_not_shown_to_the_network():
     with pytest.raises(CloudError, match="use https"):
-        HttpTransport("http://cloud.example", "r", "ab" * 16, Credentials("secret"))
+        HttpTransport(Server("http://cloud.example", "secret"), "r", "ab" * 16)
     for url in ("http://localhost:80", "http://[::1]:80", "https://cloud.example"):
-        HttpTransport(url, "r", "ab" * 16, Credentials("secret")).close()
-    HttpTransport("http://cloud.example", "r", "ab" * 16).close()
+        HttpTransport(Server(url, "secret"), "r", "ab" * 16).close()
+    HttpTransport(Server("http://cloud.example"), "r", "ab" * 16).close()
 
 
 def test_a_certificate_is_asked_for_and_must_be_signed_by_whom_is_trusted(tmp_path):
@@ -170,15 +170,15 @@ def test_a_certificate_is_asked_for_and_must_be_signed_by_whom_is_trusted(tmp_pa
     for folder in (ours, others):
         make_credentials(folder, ["127.0.0.1"], {}, datetime.now(UTC))
     with serving(tls=ours) as cloud:
-        trusting = HttpTransport(cloud.url, "r", "ab" * 16, Credentials("secret", ours / "ca.pem"))
+        trusting = HttpTransport(Server(cloud.url, "secret", ours / "ca.pem"), "r", "ab" * 16)
         assert len(trusting.send(PACKETS, -1).packets) == 1
         trusting.close()
         for ca in (None, others / "ca.pem"):
-            wary = HttpTransport(cloud.url, "r", "ab" * 16, Credentials("secret", ca))
+            wary = HttpTransport(Server(cloud.url, "secret", ca), "r", "ab" * 16)
             with pytest.raises(CloudError, match="its certificate is not trusted"):
                 wary.send(PACKETS, -1)
             wary.close()
-        plain = HttpTransport(cloud.url.replace("https", "http"), "r", "ab" * 16)
+        plain = HttpTransport(Server(cloud.url.replace("https", "http")), "r", "ab" * 16)
         with pytest.raises(UnavailableError, match="its address begins with https://"):
             plain.send(PACKETS, -1)
         plain.close()
@@ -197,7 +197,7 @@ def test_a_certificate_of_another_name_or_date_gets_no_packet_and_no_token(host,
     make_credentials(tmp_path, [], {}, datetime.now(UTC) + timedelta(days))
     with serving(tls=tmp_path) as cloud:
         url = cloud.url.replace("127.0.0.1", host)
-        wary = HttpTransport(url, "r", "ab" * 16, Credentials("secret", tmp_path / "ca.pem"))
+        wary = HttpTransport(Server(url, "secret", tmp_path / "ca.pem"), "r", "ab" * 16)
         with pytest.raises(CloudError, match=said):
             wary.send(PACKETS, -1)
         wary.close()
@@ -205,7 +205,7 @@ def test_a_certificate_of_another_name_or_date_gets_no_packet_and_no_token(host,
 
 
 def test_a_cloud_without_tls_is_named(cloud):
-    secure = HttpTransport(cloud.url.replace("http", "https"), "r", "ab" * 16)
+    secure = HttpTransport(Server(cloud.url.replace("http", "https")), "r", "ab" * 16)
     with pytest.raises(UnavailableError, match="its address begins with http://"):
         secure.send(PACKETS, -1)
     secure.close()
@@ -216,4 +216,4 @@ def test_an_authority_must_be_readable(tmp_path, content):
     if content is not None:
         (tmp_path / "ca.pem").write_bytes(content)
     with pytest.raises(CloudError, match="give a PEM file"):
-        HttpTransport("https://cloud.example", "r", "ab" * 16, Credentials(ca=tmp_path / "ca.pem"))
+        HttpTransport(Server("https://cloud.example", ca=tmp_path / "ca.pem"), "r", "ab" * 16)

@@ -16,7 +16,7 @@ from fcslam.lab.presets import Preset
 if TYPE_CHECKING:
     from fcslam.config import SettingsType
     from fcslam.mission.mission import MissionConfig
-    from fcslam.wire.http_transport import Server
+    from fcslam.wire.keys import Server
 
 _ONE_KEY = re.compile(r"([a-z][a-z0-9_.]*)=(.*)", re.DOTALL)
 
@@ -134,14 +134,9 @@ def output_option(description: str, parent: str) -> Any:
 
 def access(server: str | None, credentials: Path | None, budget_kBps: float | None = None) -> "Server | None":
     """The service that a robot sends to; None if none is named."""
-    from fcslam.wire.http_transport import Server
-    from fcslam.wire.keys import NO_CREDENTIALS, read_credentials
+    from fcslam.wire.keys import read_server
 
-    found = NO_CREDENTIALS if credentials is None else read_credentials(credentials)
-    if server is None:
-        return None
-    own = found.own if server.startswith("https:") else None  # a certificate is shown in TLS only
-    return Server(server, found.token, found.ca, own, budget_kBps)
+    return None if server is None else read_server(server, credentials, budget_kBps)
 
 
 def chosen_settings(

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from fcslam.learning.federated.learning_process import RobotLearningPlan
     from fcslam.learning.trainer import ExecutionOptions
     from fcslam.robot.frontend import RobotConfig
-    from fcslam.wire.http_transport import Server
+    from fcslam.wire.keys import Server
 
 TRAINING_OUTPUT = "Folder for everything that training writes. If it holds an unfinished run, training continues it."
 

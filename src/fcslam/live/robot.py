@@ -53,8 +53,8 @@ from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.warmup import warm_up_space, warm_up_tracking
 from fcslam.wire.checks import check_floor
 from fcslam.wire.fleet_client import FleetClient
-from fcslam.wire.http_transport import HttpTransport, Server
-from fcslam.wire.keys import Credentials
+from fcslam.wire.http_transport import HttpTransport
+from fcslam.wire.keys import Server
 from fcslam.wire.messages import Packet
 
 if TYPE_CHECKING:
@@ -411,10 +411,10 @@ class Robot(LiveTracker):
     ) -> Uplink:
         transport, budget_kBps = wiring.transport, None
         if access is not None:
-            shown, budget_kBps = Credentials(access.token, access.ca, access.certificate), access.budget_kBps
-            transport = stack.enter_context(closing(HttpTransport(access.url, self.name, outbox.agent, shown)))
+            budget_kBps = access.budget_kBps
+            transport = stack.enter_context(closing(HttpTransport(access, self.name, outbox.agent)))
             if follows_fleet:
-                self.fleet = FleetView(FleetClient(access.url, shown), self.name, self._place, budget_kBps)
+                self.fleet = FleetView(FleetClient(access), self.name, self._place, budget_kBps)
                 stack.enter_context(closing(self.fleet)).start()
                 self._joint = JointMap(self.fleet, self._config.map)
         assert transport is not None

@@ -1,6 +1,7 @@
 """A copy of the maps of a cloud, for a robot that finds itself in them: also when the cloud cannot be reached."""
 
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -13,8 +14,8 @@ from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.folder import MISSION, is_run_folder
 from fcslam.wire.fleet_client import MapClient
 from fcslam.wire.fleet_replies import ServedMap
-from fcslam.wire.http_transport import Server, addresses
-from fcslam.wire.keys import Credentials
+from fcslam.wire.http_transport import addresses
+from fcslam.wire.keys import Server
 
 _ATTEMPTS: Final = 3
 """The cloud may draw its maps again while the robot reads them."""
@@ -33,7 +34,7 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
     prepare_output(folder, force=True)
     troubles = []
     for address in addresses(server.url):
-        with closing(MapClient(address, Credentials(server.token, server.ca, server.certificate))) as client:
+        with closing(MapClient(replace(server, url=address))) as client:
             try:
                 _read(client, address).save(folder, force=True)
                 return None

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
-from fcslam.errors import CloudError, InputError, OversizeError, PacketError, UnavailableError
-from fcslam.records import Channel, StrPath
+from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
+from fcslam.records import Channel
 from fcslam.wire.batches import (
     AGENT_HEADER,
     CORRECTION_HEADER,
@@ -21,7 +21,7 @@ from fcslam.wire.batches import (
     read_batch,
     write_batch,
 )
-from fcslam.wire.keys import NO_CREDENTIALS, Credentials, no_passphrase
+from fcslam.wire.keys import Server, no_passphrase
 from fcslam.wire.limits import MAXIMUM_NETWORK_BYTES
 
 if TYPE_CHECKING:
@@ -49,26 +49,6 @@ class HttpResponse:
 
 
 @dataclass(frozen=True, slots=True)
-class Server:
-    """A cloud, how a robot shows it who it is, and how much the robot may send."""
-
-    url: str
-    """Address of the cloud, or those of its instances with commas between them."""
-    token: str | None = field(default=None, repr=False)
-    """The robot's bearer token; ``repr`` hides it."""
-    ca: StrPath | None = None
-    """PEM file of the authority that signed the cloud's certificate; None: the authorities of the system."""
-    certificate: tuple[StrPath, StrPath] | None = None
-    """PEM files of the robot's certificate and key, which replace the token."""
-    budget_kBps: float | None = None
-    """Limit of the uplink, kB per second by the stamps, above 0; None: everything is sent."""
-
-    def __post_init__(self) -> None:
-        if self.budget_kBps is not None and not self.budget_kBps > 0.0:
-            raise InputError(f"{self.url}: budget_kBps={self.budget_kBps}; give a number above 0, or None for no limit")
-
-
-@dataclass(frozen=True, slots=True)
 class CloudState:
     """The packets that the cloud has of a robot."""
 
@@ -88,19 +68,19 @@ class HttpClient:
     most_reply_bytes = 4 * MAXIMUM_NETWORK_BYTES
     """A longer reply is not read: a map of 16,000 by 16,000 cells has as many bytes."""
 
-    def __init__(self, url: str, shown: Credentials = NO_CREDENTIALS, headers: Mapping[str, str] | None = None) -> None:
-        """Open a client of the address ``url``, or of several with commas between them; requests have the headers."""
+    def __init__(self, server: Server, headers: Mapping[str, str] | None = None) -> None:
+        """Open a client of a cloud; requests have the headers."""
         import httpx
 
-        self._urls = deque(address.rstrip("/") for address in addresses(url))
+        self._urls = deque(address.rstrip("/") for address in addresses(server.url))
         for address in self._urls:
-            _check_url(address, shown)
-        self._has_own = shown.own is not None
+            _check_url(address, server)
+        self._has_own = server.certificate is not None
         self._client = httpx.Client(
             base_url=f"{self._url}/api/v1/",
-            headers=dict(headers or {}) | ({"Authorization": f"Bearer {shown.token}"} if shown.token else {}),
+            headers=dict(headers or {}) | ({"Authorization": f"Bearer {server.token}"} if server.token else {}),
             timeout=httpx.Timeout(ANSWER_TIMEOUT_S, connect=CONNECT_TIMEOUT_S),
-            verify=_trust(shown),
+            verify=_trust(server),
             trust_env=False,
         )
 
@@ -206,9 +186,9 @@ class HttpClient:
 class HttpTransport(HttpClient):
     """Connection of one robot to its cloud; docs/howto/robot.md lists how it handles status codes."""
 
-    def __init__(self, url: str, robot: str, agent: str, shown: Credentials = NO_CREDENTIALS) -> None:
+    def __init__(self, server: Server, robot: str, agent: str) -> None:
         """Open a client; raises as ``HttpClient``. ``agent``: random, to distinguish two processes of one robot."""
-        super().__init__(url, shown, {AGENT_HEADER: agent, "Content-Type": MEDIA_TYPE})
+        super().__init__(server, {AGENT_HEADER: agent, "Content-Type": MEDIA_TYPE})
         self._robot = quote(robot, safe="")
 
     def state(self) -> CloudState:
@@ -277,7 +257,7 @@ def _detail(response: "httpx.Response") -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _check_url(url: str, shown: Credentials) -> None:
+def _check_url(url: str, server: Server) -> None:
     try:
         parts = urlsplit(url)
         is_address = parts.scheme in ("http", "https") and parts.port != 0 and not any(map(str.isspace, url))
@@ -288,9 +268,9 @@ def _check_url(url: str, shown: Credentials) -> None:
             f"{url!r} is not the address of a cloud; give one like https://cloud.example:8443, "
             "on this machine http://127.0.0.1:8340"
         )
-    if shown.token and parts.scheme == "http" and not is_loopback(parts.hostname):
+    if server.token and parts.scheme == "http" and not is_loopback(parts.hostname):
         raise CloudError(f"{url}: a token would be sent unencrypted; use https")
-    if shown.own and parts.scheme == "http":
+    if server.certificate and parts.scheme == "http":
         raise CloudError(f"{url}: certificates need https")
 
 
@@ -302,8 +282,8 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def _trust(shown: Credentials) -> ssl.SSLContext:
-    ca, own = shown.ca, shown.own
+def _trust(server: Server) -> ssl.SSLContext:
+    ca, own = server.ca, server.certificate
     try:
         context = ssl.create_default_context(cafile=None if ca is None else str(ca))
     except (OSError, ssl.SSLError) as error:

@@ -1,10 +1,9 @@
-"""Files with which a robot shows who it is: tokens, and keys of TLS."""
+"""A cloud as a robot knows it, and the files with which the robot shows who it is: tokens, and keys of TLS."""
 
 import os
 import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
 
 from fcslam.errors import InputError
 from fcslam.records import StrPath
@@ -14,22 +13,32 @@ TOKEN, AUTHORITY, CERTIFICATE, KEY = "token", "ca.pem", "client.pem", "client.ke
 
 
 @dataclass(frozen=True, slots=True)
-class Credentials:
-    """What a robot shows a service, and how it knows the service."""
+class Server:
+    """A cloud, how a robot shows it who it is, and how much the robot may send."""
 
+    url: str
+    """Address of the cloud, or those of its instances with commas between them."""
     token: str | None = field(default=None, repr=False)
+    """The robot's bearer token; ``repr`` hides it."""
     ca: StrPath | None = None
-    """PEM file of the authority that signed the service's certificate; None: the authorities of this system."""
-    own: tuple[StrPath, StrPath] | None = None
-    """PEM files of the robot's certificate and its key, in place of a token."""
+    """PEM file of the authority that signed the cloud's certificate; None: the authorities of the system."""
+    certificate: tuple[StrPath, StrPath] | None = None
+    """PEM files of the robot's certificate and key, which replace the token."""
+    budget_kBps: float | None = None
+    """Limit of the uplink, kB per second by the stamps, above 0; None: everything is sent."""
+
+    def __post_init__(self) -> None:
+        if self.budget_kBps is not None and not self.budget_kBps > 0.0:
+            raise InputError(f"{self.url}: budget_kBps={self.budget_kBps}; give a number above 0, or None for no limit")
 
 
-NO_CREDENTIALS: Final = Credentials()
-"""For a service that asks for none."""
+def read_server(url: str, folder: Path | None, budget_kBps: float | None = None) -> Server:
+    """A cloud with the credentials in a robot's folder, as `fcslam tools certificates` writes it.
 
-
-def read_credentials(folder: Path) -> Credentials:
-    """The credentials in a robot's folder, as `fcslam tools certificates` writes it; each file may be missing."""
+    Each file may be missing. None: the cloud asks for none.
+    """
+    if folder is None:
+        return Server(url, budget_kBps=budget_kBps)
     there = {name for name in (TOKEN, AUTHORITY, CERTIFICATE, KEY) if os.path.exists(folder / name)}
     if not there:
         raise InputError(
@@ -38,10 +47,13 @@ def read_credentials(folder: Path) -> Credentials:
         )
     if (CERTIFICATE in there) != (KEY in there):
         raise InputError(f"{folder}: {CERTIFICATE} and {KEY} belong together; add the other one, or remove this one")
-    return Credentials(
+    return Server(
+        url,
         read_token(folder / TOKEN) if TOKEN in there else None,
         folder / AUTHORITY if AUTHORITY in there else None,
-        (folder / CERTIFICATE, folder / KEY) if KEY in there else None,
+        # a certificate is shown in TLS only
+        (folder / CERTIFICATE, folder / KEY) if KEY in there and url.startswith("https:") else None,
+        budget_kBps,
     )
 
 

@@ -7,6 +7,7 @@ import threading
 from fcslam.learning.federated.fleet_grid import FleetGrid
 from fcslam.learning.federated.fleet_server import listening
 from fcslam.learning.federated.robot_learning import RobotLink, serve_requests
+from fcslam.wire.keys import Server
 
 
 class _EndedError(Exception):
@@ -31,7 +32,7 @@ class LiveFleet:
                 yield self
 
     def link(self, robot):
-        return contextlib.closing(RobotLink(self.address, robot))
+        return contextlib.closing(RobotLink(Server(self.address), robot))
 
     def start(self, client):
         """Let a robot answer requests until the server ends."""

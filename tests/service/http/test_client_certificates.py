@@ -11,7 +11,7 @@ from fcslam.service.authentication import Authenticator, Identity, Role, read_to
 from fcslam.service.credentials import make_credentials
 from fcslam.service.http.protocol import GuardedProtocol
 from fcslam.wire.http_transport import HttpTransport
-from fcslam.wire.keys import Credentials
+from fcslam.wire.keys import Server
 from fcslam.wire.messages import Acknowledgement
 from fcslam.wire.packets import decode
 from tests.service.http.desk import A, B, Desk
@@ -50,7 +50,7 @@ def connect(tmp_path, scripted, authority):
 
         def made(own, robot="a", token=None):
             url = str(desk.client.base_url).replace("http:", "https:")
-            transports.append(HttpTransport(url, robot, "ab" * 16, Credentials(token, authority / "ca.pem", own)))
+            transports.append(HttpTransport(Server(url, token, authority / "ca.pem", own), robot, "ab" * 16))
             return transports[-1]
 
         made.desk = desk
@@ -126,7 +126,7 @@ def test_the_common_name_must_be_a_robots(subject, who):
 def test_a_certificate_that_cannot_be_used_is_told(authority, tmp_path):
     with pytest.raises(CloudError, match="cannot read the certificate and its key"):
         HttpTransport(
-            "https://cloud.example", "a", "ab" * 16, Credentials(own=(authority / "ca.pem", tmp_path / "none"))
+            Server("https://cloud.example", certificate=(authority / "ca.pem", tmp_path / "none")), "a", "ab" * 16
         )
     with pytest.raises(CloudError, match="need https"):
-        HttpTransport("http://localhost", "a", "ab" * 16, Credentials(own=own_pair(authority, "a")))
+        HttpTransport(Server("http://localhost", certificate=own_pair(authority, "a")), "a", "ab" * 16)

@@ -44,7 +44,7 @@ from fcslam.records import FloatArray
 from fcslam.robot.keyframe_folder import KeptKeyframe, read_keyframes
 from fcslam.storage.files import write_file
 from fcslam.wire.http_transport import HttpClient
-from fcslam.wire.keys import NO_CREDENTIALS, Credentials, read_credentials
+from fcslam.wire.keys import Server, read_server
 
 _T = TypeVar("_T")
 
@@ -62,13 +62,10 @@ FRESH_S: Final = 20.0
 
 
 class RobotLink(HttpClient):
-    """The connection of a robot with the service that it learns at.
+    """The connection of a robot with the service that it learns at; ``robot`` is its name."""
 
-    ``url`` and ``shown`` are as in ``HttpClient``; ``robot`` is its name.
-    """
-
-    def __init__(self, url: str, robot: str, shown: Credentials = NO_CREDENTIALS) -> None:
-        super().__init__(url, shown)
+    def __init__(self, server: Server, robot: str) -> None:
+        super().__init__(server)
         self.robot = robot
         self._path = f"robots/{quote(robot, safe='')}/learning/"
         self._client.timeout = httpx.Timeout(ANSWER_S)
@@ -267,11 +264,11 @@ def main(arguments: Sequence[str]) -> int:
             emit_event(NOTICE, line)
 
     try:
-        shown = Credentials() if given.credentials is None else read_credentials(given.credentials)
+        server = read_server(given.server, given.credentials)
         client = RevisitClient(given.name, given.cache)
         robot = LearningRobot(given.keyframes, client, given.settings.cpu_s, idle, notice)
         client.on_step = robot.pause
-        with closing(RobotLink(given.server, given.name, shown)) as link:
+        with closing(RobotLink(server, given.name)) as link:
             serve_requests(link, client, notice, is_ready=robot.prepare)
     except (FcslamError, OSError) as error:
         notice(f"learning ends: {error}")
