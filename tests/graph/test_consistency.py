@@ -119,11 +119,11 @@ def test_where_the_maps_refute_the_largest_cluster_they_may_confirm_the_one_that
     def decide(examine):
         return dominant_cluster(consistent, places, np.ones(len(closures.i), dtype=bool), SETTINGS, examine)
 
-    found = decide(lambda rows: GOOD if rows.max() < 12 else BAD)
+    found = decide(lambda rows, _: GOOD if rows.max() < 12 else BAD)
     assert found.dominant
     assert set(found.members) <= set(range(12))
     assert found.evidence.fit.support == GOOD.support
-    refuted = decide(lambda _: BAD)
+    refuted = decide(lambda *_: BAD)
     assert not refuted.dominant
     assert refuted.contested
 
@@ -138,7 +138,7 @@ def test_clusters_that_the_maps_refute_outnumber_no_other() -> None:
     def decide(right: int, fit: MapFit):
         informative = np.ones(len(group), dtype=bool)
         return dominant_cluster(
-            consistent, places, informative, SETTINGS, lambda rows: fit if (group[rows] == right).all() else BAD
+            consistent, places, informative, SETTINGS, lambda rows, _: fit if (group[rows] == right).all() else BAD
         )
 
     found = decide(5, GOOD)
@@ -359,3 +359,19 @@ def test_places_that_are_one_place_to_one_robot_give_no_direction(still):
     closures = Closures(i, j, np.zeros((2, 3)), np.tile(INFORMATION, (2, 1, 1)))
     T_a_b = se2.between(se2.inverse(a.poses[i[0]]), se2.inverse(b.poses[j[0]]))
     assert relative_frame(a, b, closures) == pytest.approx(T_a_b)
+
+
+def test_a_search_for_transforms_elsewhere_may_decide_only_where_the_maps_would_be_enough() -> None:
+    a, b, closures = two_robots(0, true=12, false=0, aliases=0)
+    consistent, informative = pairwise_consistency(a, b, closures), np.ones(12, dtype=bool)
+    one_place = np.zeros((12, 2))
+    asked = []
+
+    def decide(fit: MapFit):
+        return dominant_cluster(
+            consistent, one_place, informative, SETTINGS, lambda _, may_decide: asked.append(may_decide(fit)) or fit
+        )
+
+    assert decide(GOOD).dominant
+    assert not decide(replace(GOOD, support=25.0, expected=20.0)).dominant
+    assert asked == [True, False]

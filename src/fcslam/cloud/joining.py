@@ -14,8 +14,7 @@ from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.result import Fusion
 from fcslam.cloud.sessions import robot_of
 from fcslam.geometry.groups import Group
-from fcslam.graph import cluster
-from fcslam.graph.cluster import ClusterDecision
+from fcslam.graph.cluster import ClusterDecision, MayDecide, decide_cluster
 from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import ClusterEvidence, ConsistencySettings, MapFit
 from fcslam.graph.joint import JointEvidence, solve_jointly
@@ -24,7 +23,7 @@ from fcslam.graph.pose_graph import PoseGraph
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import ClosureStatus, FloatArray, Reason, ReasonCode, frozen
 
-ExamineSessions = Callable[[tuple[str, str], Trajectory, Trajectory, Closures], MapFit | None]
+ExamineSessions = Callable[[tuple[str, str], Trajectory, Trajectory, Closures, MayDecide], MapFit | None]
 """As ``MapComparison.fit``."""
 
 CONSISTENCY = "fleet.consistency"
@@ -41,8 +40,8 @@ def decide_join(
     """The dominant cluster among the closures of two robots, by the current estimate of their trajectories."""
     a, b = (graph.path(robot) for robot in robots)
     informative, closures = [entry.closure.informative for entry in entries], _closures(entries, robots[0], graph.group)
-    return cluster.decide_cluster(
-        a, b, closures, informative, settings, lambda members: examine(robots, a, b, closures.select(members))
+    return decide_cluster(
+        a, b, closures, informative, settings, lambda rows, may: examine(robots, a, b, closures.select(rows), may)
     )
 
 

@@ -1,16 +1,14 @@
 """Comparison of the maps of two sessions: exhaustive around the places that match, or where a joint map lays them."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.space import Space
-from fcslam.geometry import se2
-from fcslam.geometry.groups import SE2, group_of
-from fcslam.graph.cluster import local_frames, relative_frame
+from fcslam.geometry.groups import group_of
+from fcslam.graph.cluster import MayDecide, local_frames, relative_frame
 from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import AGREES_M, AGREES_RAD, LARGEST_CONTRADICTION, LEAD, MapFit, refutation
 from fcslam.graph.trajectory import Trajectory
@@ -43,6 +41,8 @@ class _Compared:
     size: int
     """Number of keyscans of both sessions."""
     fit: MapFit
+    is_searched: bool
+    """Whether no transform elsewhere matters that the fit does not have."""
 
     @property
     def agrees(self) -> bool:
@@ -60,7 +60,13 @@ class MapComparison(Kept):
         """The last comparisons of each pair of sessions, one for each transform: later, places may be forgotten."""
 
     def fit(
-        self, sessions: tuple[str, str], a: Trajectory, b: Trajectory, members: Closures, growth: float = GROWTH
+        self,
+        sessions: tuple[str, str],
+        a: Trajectory,
+        b: Trajectory,
+        members: Closures,
+        may_decide: MayDecide,
+        growth: float = GROWTH,
     ) -> MapFit | None:
         """Compare the maps of two sessions, always in the same order, at the transform of a cluster and elsewhere.
 
@@ -68,17 +74,18 @@ class MapComparison(Kept):
         the places. An earlier comparison at the same transform counts until the cluster or the paths have grown by a
         factor, if the maps agreed clearly until the paths have, and for good if keyscans were released since.
         """
-        in_plane, pair, size = (a.to_plane(), b.to_plane()), frozenset(sessions), len(a) + len(b)
-        T_a_b = relative_frame(*in_plane, members.to_plane())
-        earlier = [each for each in self._compared.get(pair, ()) if self._is_at(each, *in_plane, T_a_b)]
-        is_clear = bool(earlier) and earlier[0].agrees and earlier[0].fit.ratio >= LEAD
-        if is_clear and size < growth * growth * earlier[0].size:
-            return earlier[0].fit
-        if earlier and len(members) < growth * earlier[0].closures and size < growth * earlier[0].size:
-            return earlier[0].fit
-        found = self._compare(sessions, a, b, members, T_a_b, earlier)
+        pair, size, T_a_b = frozenset(sessions), len(a) + len(b), relative_frame(a, b, members)
+        kept = self._compared.get(pair, [])
+        same = [each for each in kept if self._is_at(each, a, b, T_a_b)]
+        earlier = same[0] if same else None
+        if earlier is not None and (earlier.is_searched or not may_decide(earlier.fit)):
+            is_clear = earlier.agrees and earlier.fit.ratio >= LEAD
+            has_grown = size > growth * earlier.size or len(members) > growth * earlier.closures
+            if size <= growth * growth * earlier.size if is_clear else not has_grown:
+                return earlier.fit
+        found = self._compare(sessions, a, b, members, T_a_b, may_decide, earlier)
         if found is not None:
-            others = [c for c in self._compared.get(pair, ()) if c not in earlier and size < GROWTH * c.size]
+            others = [each for each in kept if each not in same and size < GROWTH * each.size]
             self._compared[pair] = [found, *others[: MOST_TRANSFORMS - 1]]
         return None if found is None else found.fit
 
@@ -87,7 +94,7 @@ class MapComparison(Kept):
         return size / min((each.size for each in self._compared.get(sessions, ()) if each.agrees), default=size)
 
     def agree_still(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> bool:
-        """Whether maps that agreed do so at the poses (N, 3) of a joint map, after the paths have grown."""
+        """Whether maps that agreed do so at the poses (N, P) of a joint map, after the paths have grown."""
         fit, pair, size = self.at(sessions, poses_a, poses_b), frozenset(sessions), len(poses_a) + len(poses_b)
         self._compared[pair] = [replace(each, size=size) if each.agrees else each for each in self._compared[pair]]
         return not fit.is_compared or refutation(fit) is None
@@ -106,46 +113,43 @@ class MapComparison(Kept):
         b: Trajectory,
         members: Closures,
         T_a_b: FloatArray,
-        earlier: list[_Compared],
+        may_decide: MayDecide,
+        earlier: _Compared | None,
     ) -> _Compared | None:
         # SciPy's transforms take as long to load as a hundred scans, and most missions compare no maps.
         from fcslam.lidar.uniqueness import align_map, alignments, parallel_headings
 
-        seen_through = partial(self._space.seen_through, sessions, a.poses, b.poses, local_frames(a, b, members))
-        a, b, members = a.to_plane(), b.to_plane(), members.to_plane()
-        local_maps = self._local_maps(sessions, a.poses, b.poses)
-        near_a, i, is_complete_a = local_maps.around(0, a.poses[members.i, :2].mean(axis=0))
-        near_b, j, is_complete_b = local_maps.around(1, b.poses[members.j, :2].mean(axis=0))
+        group, local_maps = group_of(a.poses), self._local_maps(sessions, a.poses, b.poses)
+        near_a, i, is_complete_a = local_maps.around(0, a.poses[members.i, : group.axes].mean(axis=0))
+        near_b, j, is_complete_b = local_maps.around(1, b.poses[members.j, : group.axes].mean(axis=0))
         keyscans = min(len(near_a), len(near_b))
-        if earlier and not (is_complete_a and is_complete_b) and earlier[0].keyscans > keyscans:
-            return replace(earlier[0], closures=len(members), size=len(a) + len(b))
+        if earlier and not (is_complete_a and is_complete_b) and earlier.keyscans > keyscans:
+            return replace(earlier, closures=len(members), size=len(a) + len(b))
         if not keyscans:
             return None
-        T_a_i, T_b_j = a.poses[i.number], b.poses[j.number]
-        T_i_j = _between(T_a_i, T_a_b, T_b_j)
-        fit = _fit(local_maps.agreement(local_frames(a, b, members)))
+        frames, T_a_i, T_b_j = local_frames(a, b, members), a.poses[i.number], b.poses[j.number]
+        T_i_j, fit = _between(T_a_i, T_a_b, T_b_j), _fit(local_maps.agreement(frames))
         if refutation(fit) is None:
-            fit = replace(fit, seen_through=seen_through())
-        if refutation(fit) is None:  # else no transform elsewhere matters
+            fit = replace(fit, seen_through=self._space.seen_through(sessions, a.poses, b.poses, frames))
+        is_searched = refutation(fit) is not None  # then no transform elsewhere matters
+        if not is_searched and may_decide(fit):
+            is_searched = True
             whole_a, whole_b = local_maps.whole(0, near_a, i.number), local_maps.whole(1, near_b, j.number)
             best = align_map(whole_a, whole_b, T_i_j)
             fit = replace(fit, seen_m=best.known_m)
             found_elsewhere = alignments(whole_a, whole_b, best.T_a_b, parallel_headings(whole_a, whole_b))
             for rival in (each for each in found_elsewhere[:RIVALS] if each.score_m > 0.0):
-                T = se2.compose(se2.compose(T_a_i, rival.T_a_b), se2.inverse(T_b_j))
+                T = group.compose(group.compose(T_a_i, group.from_plane(rival.T_a_b)), group.inverse(T_b_j))
                 # Two places that look alike may both fit badly; the better one is more likely.
                 found = _fit(local_maps.agreement(np.broadcast_to(T, b.poses.shape)))
                 if found.support > fit.rival_support and found.contradiction <= LARGEST_CONTRADICTION:
                     fit = replace(fit, rival_support=found.support)
-        return _Compared(i, j, frozen(T_i_j), keyscans, len(members), len(a) + len(b), fit)
+        return _Compared(i, j, frozen(T_i_j), keyscans, len(members), len(a) + len(b), fit, is_searched)
 
     def at(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> MapFit:
-        """Compare the maps of two sessions at poses (N, P) of their keyscans in the frame of one map."""
-        group = group_of(poses_a)
-        local_maps = self._local_maps(sessions, group.to_plane(poses_a), group.to_plane(poses_b))
-        fit = _fit(local_maps.agreement(np.zeros((len(poses_b), SE2.size))))
-        same = np.broadcast_to(group.identity, poses_b.shape)
-        return replace(fit, seen_through=self._space.seen_through(sessions, poses_a, poses_b, same))
+        """Compare the walls of two sessions at poses (N, P) of their keyscans in the frame of one map."""
+        identity = np.broadcast_to(group_of(poses_b).identity, poses_b.shape)
+        return _fit(self._local_maps(sessions, poses_a, poses_b).agreement(identity))
 
     def seen_m(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> float:
         """As in ``MapFit``, at poses (N, P) in the frame of one map, around where the paths come nearest."""
@@ -153,16 +157,14 @@ class MapComparison(Kept):
 
         from fcslam.lidar.uniqueness import align_map
 
-        poses = group_of(poses_a).to_plane(poses_a), group_of(poses_b).to_plane(poses_b)
-        local_maps = self._local_maps(sessions, *poses)
-        apart_m, _ = cKDTree(poses[0][:, :2]).query(poses[1][:, :2])
-        middle = poses[1][np.argmin(apart_m), :2]
-        near = [local_maps.around(side, middle)[:2] for side in (0, 1)]
-        if not all(keyscans for keyscans, _ in near):
+        local_maps, group = self._local_maps(sessions, poses_a, poses_b), group_of(poses_a)
+        apart_m, _ = cKDTree(poses_a[:, : group.axes]).query(poses_b[:, : group.axes])
+        middle = poses_b[np.argmin(apart_m), : group.axes]
+        (near_a, i, _), (near_b, j, _) = local_maps.around(0, middle), local_maps.around(1, middle)
+        if not near_a or not near_b:
             return 0.0
-        (near_a, i), (near_b, j) = near
         whole_a, whole_b = local_maps.whole(0, near_a, i.number), local_maps.whole(1, near_b, j.number)
-        return align_map(whole_a, whole_b, se2.between(poses[0][i.number], poses[1][j.number])).known_m
+        return align_map(whole_a, whole_b, _between(poses_a[i.number], group.identity, poses_b[j.number])).known_m
 
     def _local_maps(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> LocalMaps:
         a, b = (SeenKeyscans(self._sessions.keyscans(name), self._sessions.lasers(name)) for name in sessions)
@@ -175,4 +177,6 @@ def _fit(agreement: PlaceAgreement) -> MapFit:
 
 
 def _between(T_a_i: FloatArray, T_a_b: FloatArray, T_b_j: FloatArray) -> FloatArray:
-    return se2.compose(se2.between(T_a_i, T_a_b), T_b_j)
+    """Pose of j in i in the plane, shape (3,)."""
+    group = group_of(T_a_i)
+    return group.to_plane(group.compose(group.between(T_a_i, T_a_b), T_b_j))

@@ -32,9 +32,12 @@ NODE_BUDGET = 50_000
 
 VERTEX_BUDGET = 80 * NODE_BUDGET
 """... and of branches times vertices: a branch of a large graph takes longer."""
-Examine = Callable[[NDArray[np.int64]], MapFit | None]
-"""Compares the maps at the transform of some closures, given by their rows, shape (M,), and elsewhere; None: the maps
-cannot be compared, and only separate places count."""
+MayDecide = Callable[[MapFit], bool]
+"""Whether a fit decides, unless the maps fit elsewhere as well: if not, nobody needs to look for such transforms."""
+
+Examine = Callable[[NDArray[np.int64], MayDecide], MapFit | None]
+"""Compares the maps at the transform of some closures, given by their rows, shape (M,), and, where that may decide,
+elsewhere; None: the maps cannot be compared, and only separate places count."""
 
 _NO_LEAD = ReasonCode.NO_LEAD, ReasonCode.RIVAL_PLACES
 _MAPS_DECIDE = ReasonCode.NOT_INFORMATIVE, ReasonCode.FEW_PLACES, *_NO_LEAD
@@ -82,7 +85,7 @@ def decide_cluster(
     closures: Closures,
     informative: ArrayLike,
     settings: ConsistencySettings,
-    examine: Examine = lambda _: None,
+    examine: Examine = lambda *_: None,
 ) -> ClusterDecision:
     """Decide whether the K closures from a to b have a dominant cluster; ``informative`` (K,): those that fix every
     direction.
@@ -169,7 +172,7 @@ def dominant_cluster(
     places: ArrayLike,
     informative: ArrayLike,
     settings: ConsistencySettings,
-    examine: Examine = lambda _: None,
+    examine: Examine = lambda *_: None,
     shared_tags: Callable[[NDArray[np.int64]], int] = lambda _: 0,
 ) -> ClusterDecision:
     """Find the largest consistent cluster and decide whether it is enough to join two maps.
@@ -189,7 +192,7 @@ def dominant_cluster(
             one coordinate frame.
         informative: whether each closure fixes the pose in every direction, shape (K,).
         settings: what a cluster needs.
-        examine: called with the members of a cluster that has enough closures.
+        examine: called with the members of a cluster that has enough closures, and of the one that contradicts it.
         shared_tags: counts the tags among some rows, shape (M,), that both robots saw from several keyscans.
 
     Returns:
@@ -197,12 +200,6 @@ def dominant_cluster(
     """
     xy, informs = np.asarray(places, dtype=np.float64), np.asarray(informative, dtype=bool)
     xy = xy.reshape(len(xy), xy.size // (2 * max(1, len(xy))), 2)
-    fits: dict[bytes, MapFit | None] = {}
-
-    def fit_of(rows: NDArray[np.int64]) -> MapFit | None:
-        if rows.tobytes() not in fits:
-            fits[rows.tobytes()] = examine(rows)
-        return fits[rows.tobytes()]
 
     def decide(rows: NDArray[np.int64], rivals: NDArray[np.int64]) -> tuple[ClusterEvidence, Reason | None]:
         evidence = replace(
@@ -213,10 +210,16 @@ def dominant_cluster(
         by_count = shortfall(evidence, settings)
         if by_count is not None and by_count.code not in _MAPS_DECIDE:
             return evidence, by_count
-        fit = fit_of(rows)
+
+        def may_decide(fit: MapFit) -> bool:
+            unopposed = replace(evidence, fit=fit, rival_closures=0, rival_places=0)
+            # If the maps refute this cluster, that of the rivals may be right.
+            return len(rivals) >= settings.minimum_closures or shortfall(unopposed, settings) is None
+
+        fit = examine(rows, may_decide)
         lead = evidence.closures - LEAD * evidence.rival_closures
         if fit is not None and (lead < 0.0 or evidence.separate_places < evidence.rival_places):
-            rival = fit_of(rivals)
+            rival = examine(rivals, lambda _: True)
             if rival is None:
                 return evidence, by_count
             if not rival.is_compared or refutation(rival) is None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.geometry.groups import SE2, group_of
+from fcslam.geometry.groups import group_of
 from fcslam.graph.trajectory import Trajectory, transport_covariance
 from fcslam.records import FloatArray
 
@@ -51,15 +51,6 @@ class Closures:
         T_i_j[rows] = group.inverse(self.T_i_j[rows])
         information[rows] = back.swapaxes(-1, -2) @ self.information[rows] @ back
         return Closures(i, j, T_i_j, information, self.tags)
-
-    def to_plane(self) -> "Closures":
-        """The same closures in the plane."""
-        group = group_of(self.T_i_j)
-        if group is SE2:
-            return self
-        return Closures(
-            self.i, self.j, group.to_plane(self.T_i_j), group.planar_information(self.information), self.tags
-        )
 
     def select(self, rows: NDArray[np.int64]) -> "Closures":
         """The closures with the indices ``rows``, shape (S,)."""

@@ -15,6 +15,7 @@ from fcslam.geometry.groups import SE2, group_of
 from fcslam.graph.bridges import contradicted_bridges
 from fcslam.graph.cluster import (
     ClusterDecision,
+    MayDecide,
     closure_positions,
     decide_cluster,
     evidence_of,
@@ -29,9 +30,8 @@ from fcslam.graph.single_robot import robot_trajectory, solve_single_robot
 from fcslam.graph.trajectory import Trajectory
 from fcslam.records import FloatArray, Reason, ReasonCode, frozen
 
-ExaminePair = Callable[[int, int, Trajectory, Trajectory, Closures], MapFit | None]
-"""Compares the transform that closures give between the maps of two robots with the best transform elsewhere. It takes
-the numbers of the robots, their own trajectories, and the closures."""
+ExaminePair = Callable[[int, int, Trajectory, Trajectory, Closures, MayDecide], MapFit | None]
+"""As ``Examine``: it takes the numbers of the robots, their own trajectories, and the closures."""
 
 CompareJointMaps = Callable[[int, int, FloatArray, FloatArray], MapFit]
 """Compares the maps of two robots at joint poses. It takes the numbers of the robots and the poses of their variables,
@@ -207,8 +207,8 @@ def _find_link(
     settings: ConsistencySettings,
     examine: ExaminePair,
 ) -> Link:
-    def examine_members(members: NDArray[np.int64]) -> MapFit | None:
-        return examine(*robots, *own, closures.select(members))
+    def examine_members(members: NDArray[np.int64], may_decide: MayDecide) -> MapFit | None:
+        return examine(*robots, *own, closures.select(members), may_decide)
 
     decision = decide_cluster(*own, closures, evidence.informative[edges], settings, examine_members)
     members = closures.select(np.array(decision.members, dtype=np.int64))

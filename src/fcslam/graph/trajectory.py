@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fcslam.geometry.groups import SE2, group_of
+from fcslam.geometry.groups import group_of
 from fcslam.records import FloatArray
 
 DRIFT = 0.02, 0.005
@@ -28,12 +28,6 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.poses)
-
-    def to_plane(self) -> "Trajectory":
-        """The same path in the plane; in space, without the covariance of its odometry."""
-        if group_of(self.poses) is SE2:
-            return self
-        return build_trajectory(group_of(self.poses).to_plane(self.poses))
 
     def drift(self, start: NDArray[np.int64], end: NDArray[np.int64]) -> FloatArray:
         """Covariance (K, d, d) of the motions between the poses of two rows each, in the tangent space at ``end``."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
+from fcslam.geometry.groups import group_of
 from fcslam.lidar.map_agreement import LocalSubmap, Noise, PlaceAgreement, compare, local_map, noise_of, total
 from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.lidar.submap import Submap, build_submap
@@ -26,6 +27,8 @@ LOCAL_RADIUS_M = 14.0
 FEWEST_LOCAL_KEYSCANS, MOST_LOCAL_KEYSCANS = 4, 30
 PLACES_APART_M = 0.5 * LOCAL_M
 """Distance of local maps, which overlap by half."""
+SAME_FLOOR_M = 1.5
+"""Keyscans that differ more in height are on two floors, which share no map."""
 MOST_LOCAL_MAPS = 16
 """Most places at which local maps are compared; of more, evenly spaced ones."""
 _NONE = KeyscanId("", -1)
@@ -47,19 +50,24 @@ class LocalMaps:
         poses: tuple[FloatArray, FloatArray],
         drift: tuple[float, float],
     ) -> None:
-        """``poses`` (N, 3) of all keyscans of both sessions, each in its own frame, metres and radians.
+        """``poses`` (N, P) of all keyscans of both sessions, each in its own frame, metres and radians.
 
         ``drift``: largest error of a transform between both at one place, metres and radians.
         """
-        self._seen, self._poses, self._drift = seen, poses, drift
+        self._seen, self._drift, self._group = seen, drift, group_of(poses[0])
+        self._poses, self._in_plane = poses, [self._group.to_plane(side) for side in poses]
         self._built: dict[tuple[int, int], LocalSubmap | None] = {}
 
     @cached_property
     def _places(self) -> NDArray[np.int64]:
-        return _separate(self._poses[1], np.arange(len(self._poses[1])), PLACES_APART_M)
+        return _separate(self._positions(self._poses[1]), PLACES_APART_M)
+
+    def _positions(self, poses: FloatArray) -> FloatArray:
+        """Positions (N, A) in which two floors lie as far apart as two places."""
+        return poses[:, : self._group.axes] * (1.0, 1.0, LOCAL_RADIUS_M / SAME_FLOOR_M)[: self._group.axes]
 
     def around(self, side: int, middle: FloatArray) -> tuple[list[Keyscan], KeyscanId, bool]:
-        """The keyscans of a session that are left around a point (2,), the nearest one, and whether none was released
+        """The keyscans of a session that are left around a point (A,), the nearest one, and whether none was released
         there."""
         distance_m = self._distance_m(side, middle)
         keyscans = self._keyscans(side, middle, REACH_M, MOST_KEYSCANS)
@@ -72,12 +80,13 @@ class LocalMaps:
         return build_submap(self._scans(side, keyscans, anchor), REACH_M)
 
     def _scans(self, side: int, keyscans: Sequence[Keyscan], anchor: int) -> list[tuple[PointScan, FloatArray]]:
-        lasers, poses = self._seen[side].lasers, self._poses[side]
+        lasers, poses = self._seen[side].lasers, self._in_plane[side]
         return [(keyscan_points(k, lasers), se2.between(poses[anchor], poses[k.id.number])) for k in keyscans]
 
     def _distance_m(self, side: int, middle: FloatArray) -> FloatArray:
-        distance_m: FloatArray = np.hypot(*(self._poses[side][:, :2] - middle).T)
-        return distance_m
+        off = self._poses[side][:, : self._group.axes] - middle
+        is_on_floor = np.all(np.abs(off[:, 2:]) < SAME_FLOOR_M, axis=1)
+        return np.where(is_on_floor, np.hypot(off[:, 0], off[:, 1]), np.inf)
 
     def _keyscans(self, side: int, middle: FloatArray, reach_m: float, most: int) -> list[Keyscan]:
         distance_m = self._distance_m(side, middle)
@@ -87,7 +96,7 @@ class LocalMaps:
     def agreement(self, T_a_b: FloatArray) -> PlaceAgreement:
         """Compare the local maps of both sessions wherever the first one was near a place of the second.
 
-        ``T_a_b`` between their frames at each keyscan of b, shape (N, 3), metres and radians; NaN: not known.
+        ``T_a_b`` between their frames at each keyscan of b, shape (N, P), metres and radians; NaN: not known.
         """
         from scipy.spatial import cKDTree
 
@@ -95,21 +104,21 @@ class LocalMaps:
 
         poses_a, poses_b = self._poses
         places = [row for row in self._places if np.isfinite(T_a_b[row, 0])]
-        in_a = se2.compose(T_a_b[places], poses_b[places])
-        found_m, found_rows = cKDTree(poses_a[:, :2]).query(in_a[:, :2], distance_upper_bound=LOCAL_RADIUS_M)
+        in_a = self._group.compose(T_a_b[places], poses_b[places])
+        tree = cKDTree(self._positions(poses_a))
+        found_m, found_rows = tree.query(self._positions(in_a), distance_upper_bound=LOCAL_RADIUS_M)
         nearest = np.asarray(found_rows)
         # Paths that never come near each other may have seen the same walls from two sides.
         reach_m = LOCAL_M if np.any(found_m <= LOCAL_M) else LOCAL_RADIUS_M
         near = _at_most(np.flatnonzero(found_m <= reach_m), MOST_LOCAL_MAPS)
-        rows = [(int(nearest[k]), int(places[k])) for k in near]
-        maps = [(self._at(0, i), self._at(1, j)) for i, j in rows]
+        maps = [(self._at(0, int(nearest[k])), self._at(1, int(places[k]))) for k in near]
         noises = [noise_of(filter(None, side)) for side in zip(*maps, strict=True)]
         noise = Noise(*map(max, zip(*noises, strict=True))) if noises else Noise()
         agreements = []
-        for (i, j), (map_a, map_b) in zip(rows, maps, strict=True):
+        for k, (map_a, map_b) in zip(near, maps, strict=True):
             if map_a is None or map_b is None:
                 continue
-            T_i_j = se2.compose(se2.between(poses_a[i], T_a_b[j]), poses_b[j])
+            T_i_j = self._group.to_plane(self._group.between(poses_a[nearest[k]], in_a[k]))
             aligned = align_map(map_a.submap, map_b.submap, T_i_j).T_a_b
             off = se2.between(T_i_j, aligned)
             # Farther off, another wall is the nearest one.
@@ -119,17 +128,18 @@ class LocalMaps:
 
     def _at(self, side: int, row: int) -> LocalSubmap | None:
         if (side, row) not in self._built:
-            keyscans = self._keyscans(side, self._poses[side][row, :2], LOCAL_M, MOST_LOCAL_KEYSCANS)
+            middle = self._poses[side][row, : self._group.axes]
+            keyscans = self._keyscans(side, middle, LOCAL_M, MOST_LOCAL_KEYSCANS)
             scans = self._scans(side, keyscans, row)
             is_enough = len(scans) >= FEWEST_LOCAL_KEYSCANS
             self._built[side, row] = local_map(scans, LOCAL_RADIUS_M) if is_enough else None
         return self._built[side, row]
 
 
-def _separate(poses: FloatArray, rows: NDArray[np.int64], apart_m: float) -> NDArray[np.int64]:
+def _separate(positions: FloatArray, apart_m: float) -> NDArray[np.int64]:
     chosen: list[int] = []
-    for row in rows.tolist():
-        if not chosen or np.hypot(*(poses[row, :2] - poses[chosen, :2]).T).min() >= apart_m:
+    for row in range(len(positions)):
+        if not chosen or np.linalg.norm(positions[row] - positions[chosen], axis=1).min() >= apart_m:
             chosen.append(row)
     return np.array(chosen, np.int64)
 
