@@ -140,7 +140,7 @@ def members_of(run: Run) -> dict[int, list[str]]:
 
 def judged(run: Run, k: int, building: str, group: str, estimate: FloatArray, truth: FloatArray) -> Iterator[JudgedMap]:
     """Bounds and true errors of the cells of one map, given estimated and true poses (N, 3) of its robots."""
-    certificate = json.loads(run.quality.get("quality.json", b"{}")).get(str(k))
+    certificate = json.loads(run.quality or b"{}").get(str(k))
     if certificate is None or not certificate["cells"]:
         return
     places, error_m = bends(estimate, truth)

@@ -31,7 +31,7 @@ def certificate(bound_m=0.03, **more):
 def run_of(*drives, joins=(), closures=(), said=None):
     maps = {str(one.map_index) for one in drives}
     content = json.dumps(dict.fromkeys(maps, said or certificate()))
-    return Run({one.robot: one for one in drives}, tuple(closures), tuple(joins), quality={"quality.json": content})
+    return Run({one.robot: one for one in drives}, tuple(closures), tuple(joins), quality=content)
 
 
 PAIR = run_of(drive("a"), drive("b"), joins=[JOIN])
@@ -85,7 +85,7 @@ def test_accuracy_names_the_place_and_the_drive_that_helps():
     assert str(better).endswith("drive from (0.5, 0.0) to (4.0, 0.0) again, which makes about 12 m2 good")
     assert better.concerns[0].where == ((0.5, 0.0), (4.0, 0.0))
     assert run_of(drive("a"), said=certificate(0.3)).verdict[0].use is Use.WAIT
-    assert replace(PAIR, quality={}).verdict[0].concerns[0].why == "its accuracy is not known"
+    assert replace(PAIR, quality=b"").verdict[0].concerns[0].why == "its accuracy is not known"
 
 
 def test_a_robot_that_is_apart_is_a_reserve_of_both_maps():
@@ -117,4 +117,4 @@ def test_where_the_map_is_open_is_a_fact():
 @pytest.mark.parametrize("content", [b"[]x", b"7", b'{"0": 7}', b'{"0": {"good_share": 1}}'])
 def test_a_broken_certificate_is_one_line(content):
     with pytest.raises(InputError, match=r"quality\.json is broken"):
-        _ = replace(PAIR, quality={"quality.json": content}).verdict
+        _ = replace(PAIR, quality=content).verdict

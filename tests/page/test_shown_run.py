@@ -67,7 +67,7 @@ def run():
         joins=(Join("a", "a+1", 3, 1, *[float("nan")] * 3, float("inf")), Join("a", "b", 3, 1, 9.0, 0.0, 1.0, 0.0)),
         metrics={"error": Metric("error", float("nan"), "m")},
         map_files=files("map", 160) | files("map_1", 40),
-        quality={"quality.json": b'{"0":{"bar":0.05,"cell":1.0,"cells":[],"drives":[]}}'},
+        quality=b'{"0":{"bar":0.05,"cell":1.0,"cells":[],"drives":[]}}',
         mission=mission_bytes(
             CloudConfig(),
             [Edit(1, "anna", 1e9, Veto("a", "b"))],

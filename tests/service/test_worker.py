@@ -552,14 +552,14 @@ def test_the_live_run_follows_and_its_certificate_is_computed_seldom_or_when_map
         live = open_run(cloud.folder.live)
         seen.append(sum(len(t.stamps) for t in live.trajectories.values()))
         if seen[-1]:
-            certificates.append((cloud.now, live.quality.get("quality.json")))
+            certificates.append((cloud.now, live.quality))
     computed = [at for (at, one), (_, before) in zip(certificates[1:], certificates, strict=False) if one != before]
     assert 2 <= len(computed) < len(certificates) / 2
     assert sum(np.diff(computed) < QUALITY_EVERY_S - 8.0) <= 4, "b begins, and the maps join; none between"
     cloud.now += QUALITY_EVERY_S
     cloud.work()
     live = open_run(cloud.folder.live)
-    assert set(json.loads(live.quality["quality.json"])) == {"0"}
+    assert set(json.loads(live.quality)) == {"0"}
     assert seen == sorted(seen)
     assert seen[-1] == 2 * len(POSES)
     assert len(list((cloud.folder.path / "snapshots").iterdir())) <= KEPT

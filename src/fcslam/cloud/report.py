@@ -22,7 +22,7 @@ from fcslam.maps.joint_voxels import ply_of
 from fcslam.maps.occupancy_map import OccupancyMap, map_stem, map_yaml, pgm_bytes, server_files
 from fcslam.processes import trim_memory
 from fcslam.records import PLACE_CHANNELS, ClosureStatus, FloatArray, LoopClosure, VoxelMap, frozen
-from fcslam.runs import QUALITY, ClosureRow, Join, LocalMap, Metric, RobotTrajectory, Run
+from fcslam.runs import ClosureRow, Join, LocalMap, Metric, RobotTrajectory, Run
 from fcslam.wire.ledger import Ledger, Traffic
 from fcslam.wire.messages import PacketKind
 
@@ -103,9 +103,7 @@ def run_of(
             for name, track in tracks.items()
             if with_local_maps
         },
-        quality={f"{QUALITY}.json": json.dumps(certificates, separators=(",", ":"), allow_nan=False).encode()}
-        if certificates
-        else {},
+        quality=json.dumps(certificates, separators=(",", ":"), allow_nan=False).encode() if certificates else b"",
     )
 
 

@@ -76,8 +76,8 @@ class Run(RunTables):
     """File name to content: map.pgm, map.yaml, map.png, map_1.pgm ..."""
     local_maps: Mapping[str, LocalMap] = field(default_factory=dict)
     """By robot: every robot's own map. Live results of the service have none, and their folder has no ``local``."""
-    quality: Mapping[str, bytes] = field(default_factory=dict)
-    """File name to content: quality.json, how good the maps are where."""
+    quality: bytes = b""
+    """Content of quality.json: how good the maps are where; empty: not computed."""
     mission: bytes = b""
     """The mission file: packets and edits, with which the mission can go on. Live results of the service have none."""
     localized: Mapping[str, LocalizedPoses] = field(default_factory=dict)
@@ -183,7 +183,7 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
             pose_graph_g2o=read_text(path / POSE_GRAPH, path) if maps else "",
             map_files={file.name: read_bytes(file, path) for file in sorted(pictures) if maps},
             local_maps={robot: _read_local_map(path, robot) for robot in own_maps},
-            quality={file.name: read_bytes(file, path) for file in path.glob(f"{QUALITY}.json")},
+            quality=read_bytes(path / QUALITY, path) if (path / QUALITY).exists() else b"",
             mission=read_bytes(path / MISSION, path) if maps and (path / MISSION).exists() else b"",
             localized={file.stem: read_localized(file, path) for file in sorted((path / LOCALIZATION).glob("*.csv"))},
         )
@@ -215,7 +215,9 @@ def _write(run: Run, folder: Path) -> None:
     (folder / METRICS).write_text(metrics_json(run.metrics.values()), encoding="utf-8")
     (folder / CONFIG).write_text(run.config_yaml, encoding="utf-8")
     (folder / POSE_GRAPH).write_text(run.pose_graph_g2o, encoding="utf-8")
-    for name, content in (*run.map_files.items(), *run.quality.items()):
+    if run.quality:
+        (folder / QUALITY).write_bytes(run.quality)
+    for name, content in run.map_files.items():
         (folder / name).write_bytes(content)
 
 

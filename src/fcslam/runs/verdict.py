@@ -16,8 +16,8 @@ from fcslam.records import ClosureStatus, ReasonCode
 from fcslam.runs.records import Join, RobotTrajectory, RunTables
 from fcslam.runs.separations import Separation, separations
 
-QUALITY: Final = "quality"
-"""Name of the file of the certificates, without its suffix."""
+QUALITY: Final = "quality.json"
+"""Name of the file of the certificates."""
 LEAST_PATH_M: Final = 5.0
 """A map of a shorter drive shows a room at most."""
 MOST_BARS: Final = 5.0
@@ -80,21 +80,21 @@ class MapVerdict:
         return tuple(filter(None, (*map(str, self.concerns[1:]), *self.joined, self.accuracy, self.coverage)))
 
 
-def verdicts(run: RunTables, quality: Mapping[str, bytes]) -> tuple[MapVerdict, ...]:
-    """The verdict of each map of a run, in the order of their numbers.
+def verdicts(run: RunTables, quality: bytes) -> tuple[MapVerdict, ...]:
+    """The verdict of each map of a run, in the order of their numbers; ``quality`` as in ``Run``.
 
     Raises:
         InputError: quality.json is broken.
     """
     apart = separations(run)
     try:
-        certificates = dict(json.loads(quality.get(f"{QUALITY}.json", b"{}")))
+        certificates = dict(json.loads(quality or b"{}"))
         return tuple(
             _verdict(run, k, certificates.get(str(k)), [one for one in apart if k in one.maps])
             for k in sorted({trajectory.map_index for trajectory in run.trajectories.values()})
         )
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
-        raise InputError(f"{QUALITY}.json is broken ({error})") from error
+        raise InputError(f"{QUALITY} is broken ({error})") from error
 
 
 def _verdict(run: RunTables, k: int, certificate: Mapping[str, Any] | None, apart: list[Separation]) -> MapVerdict:

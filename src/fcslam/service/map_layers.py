@@ -53,7 +53,7 @@ class MapShape(StrictModel):
     y: float = Field(default=0.0, description="of the label, metres of the map")
 
 
-_FILES: Final = {MapLayer.PLAN: PLAN_JSON, MapLayer.TAGS: TAGS_JSON, MapLayer.QUALITY: f"{QUALITY}.json"}
+_FILES: Final = {MapLayer.PLAN: PLAN_JSON, MapLayer.TAGS: TAGS_JSON, MapLayer.QUALITY: QUALITY}
 
 
 def layers_of(mission: ViewedMission, k: int) -> list[MapLayer]:

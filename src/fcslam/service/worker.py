@@ -471,8 +471,8 @@ class Worker:
     def _write_live(self, result: FleetResult, traffic: Ledger, certifies: bool) -> None:
         run = self._run(result, traffic, with_local_maps=False, with_certificates=certifies)
         if not certifies and self._certified == {name: robot.map_index for name, robot in run.trajectories.items()}:
-            files = sorted(self._folder.live.glob(f"{QUALITY}*.*"))
-            run = replace(run, quality={file.name: file.read_bytes() for file in files})
+            before = self._folder.live / QUALITY
+            run = replace(run, quality=before.read_bytes() if before.exists() else b"")
         self._folder.publish(run)
 
     def _run(

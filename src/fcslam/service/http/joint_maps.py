@@ -19,7 +19,6 @@ from fcslam.errors import InputError
 from fcslam.maps.joint_tiles import LARGEST_ANSWER
 from fcslam.maps.occupancy_map import FARTHEST_M, map_stem
 from fcslam.records import NAME
-from fcslam.runs import QUALITY
 from fcslam.service.authentication import Role
 from fcslam.service.http.limits import json_body, read_json
 from fcslam.service.http.responses import file_of, refusals, unless_known
@@ -163,7 +162,7 @@ def _qualities(folder: Path) -> tuple[QualityReply, ...]:
     """The certificates of the run in a folder; none before there are some, and while it is replaced."""
     try:
         run = viewed_run(folder)
-        certificates = json.loads(run.quality[f"{QUALITY}.json"])
+        certificates = json.loads(run.quality)
         return tuple(
             QualityReply.model_validate(
                 {

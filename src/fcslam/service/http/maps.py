@@ -52,7 +52,7 @@ _ROWS = {"type": "array", "items": _OBJECT | {"required": ["name", "value", "uni
 FILES = (
     (METRICS, JSON, _ROWS, "All metrics with their units."),
     (
-        f"{QUALITY}.json",
+        QUALITY,
         JSON,
         _OBJECT,
         "The certificate of each map, by its number; of a live map about half a minute old.",
