@@ -31,6 +31,7 @@ SECRET = "the content of a private file"
 BOMB_BYTES = 1 << 30
 
 OWN = {
+    "__init__.py": "a file of the package",
     "compiled.py": "the cache of this user",
     "wire/keys.py": "the robot's own token",
     "cli/serving.py": "written by the training that this service started",
@@ -42,7 +43,6 @@ OWN = {
     "page/routes.py": "files of the package",
     "service": "the folder of the service",
     "storage": "the folder of the service or of this user",
-    "wire/prediction.py": "files of the package",
 }
 """Where files of this user are read that nobody else wrote, by module or folder, and which ones."""
 READERS = {
