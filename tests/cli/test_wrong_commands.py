@@ -136,6 +136,7 @@ WRONG = [
     ("play r.log --server {host} --state state", "on this machine http://127.0.0.1:8340", PLAY),
     ("play r.log --server cloud --state state", "'cloud' is not the address of a cloud; give one like https://", ""),
     ("play r.log --server http://127.0.0.1:http --state state", "is not the address of a cloud", PLAY),
+    ("play r.log --server http://me:secret@{host} --state state", "has no user name and no password; remove all", PLAY),
     (f"{PLAY} --credentials nowhere", "holds no credentials (token, ca.pem, client.pem and client.key)", PLAY),
     ("play r.log --server {url} --state notes.txt", "notes.txt: cannot be made (File exists); give another", PLAY),
     ("play r+1=r.log --server {url} --state state", "name it without '+1'", PLAY),

@@ -94,6 +94,16 @@ def test_what_never_will(cloud, transport, status, more, kind, end):
         transport.send(PACKETS, -1)
 
 
+def test_a_token_that_was_good_may_be_good_again(cloud, transport):
+    transport.send(PACKETS[:1], -1)
+    cloud.canned += [error(401, "unknown token"), error(403, "another robot's")]
+    with pytest.raises(UnavailableError, match=r"unknown token \(401\)"):
+        transport.state()
+    with pytest.raises(CloudError, match=r"another robot's \(403\)") as caught:
+        transport.state()
+    assert not isinstance(caught.value, UnavailableError)
+
+
 def test_answers_that_are_none(cloud, transport):
     cloud.canned += [(200, {}, b"noise"), (502, {}, b"<html>"), (404, {}, b"[]")]
     with pytest.raises(UnavailableError, match="the reply is broken"):

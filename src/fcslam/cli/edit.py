@@ -1,8 +1,10 @@
 """`fcslam edit`: corrections of a mission by hand. Each is a line of a log, counts in later maps, and can be undone."""
 
 import getpass
+import re
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +13,7 @@ import typer
 
 from fcslam.cli.inputs import numbers
 from fcslam.cli.inputs import pose as read_pose
+from fcslam.cli.output import answers
 from fcslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,6 +31,8 @@ _NEGATIVE = {"ignore_unknown_options": True}
 _EVER_S = 1e12
 """Begins and ends a stretch without a stamp: no file of edits holds infinities."""
 
+_BELOW_MM = r"(?<=\.\d{3})\d+"
+
 Mission = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder or mission file.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, in whose map you read the coordinates.")]
 MapIndex = Annotated[int, typer.Option("--map", min=0, help="Number of the map, as in map_1.png.")]
@@ -43,19 +48,21 @@ StampJ = Annotated[float, typer.Argument(metavar="STAMP_J", help="Seconds, of th
 
 @app.command("list")
 def list_edits(mission: Mission) -> None:
-    """Print all edits of a mission: number, time, author, content, and what undid them."""
-    from fcslam.cloud.edits import edit_json, kind_of, undone
+    """List all edits of a mission: number, time, author, change, and what undid it."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from fcslam.cloud.edits import kind_of, undone
     from fcslam.mission.mission_file import read_mission
 
-    edits = read_mission(mission).edits
+    edits, table = read_mission(mission).edits, Table("edit", "time", "author", "change", "undone by")
     gone = undone(edits)
     for edit in edits:
         when = f"{datetime.fromtimestamp(edit.time_s, UTC):%Y-%m-%d %H:%M:%S} UTC" if edit.time_s else "from the start"
-        end = f"  undone by {gone[edit.number]}" if edit.number in gone else ""
-        content = f"{kind_of(edit.content)} {edit_json(edit.content)}"
-        typer.echo(f"{edit.number}  {when}  {edit.author}  {content}{end}")
-    if not edits:
-        typer.echo("no edits")
+        values = ", ".join(f"{name} {value}" for name, value in asdict(edit.content).items() if value is not None)
+        change = f"{kind_of(edit.content)}: {re.sub(_BELOW_MM, '', values)}"
+        table.add_row(*map(Text, (str(edit.number), when, edit.author, change, str(gone.get(edit.number, "")))))
+    answers().print(table if edits else "no edits")
 
 
 @app.command()
@@ -136,8 +143,7 @@ def remove(
     if first_s is None and last_s is None:
         _append(mission, Removal(robot, None if session == robot else epoch))
     else:
-        first, last = (-_EVER_S if first_s is None else first_s), (_EVER_S if last_s is None else last_s)
-        _append(mission, Cut(session, max(first, -_EVER_S), min(last, _EVER_S)))
+        _append(mission, Cut(session, -_EVER_S if first_s is None else first_s, _EVER_S if last_s is None else last_s))
 
 
 @app.command(context_settings=_NEGATIVE)

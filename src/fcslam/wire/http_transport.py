@@ -75,7 +75,7 @@ class HttpClient:
         self._urls = deque(address.rstrip("/") for address in addresses(server.url))
         for address in self._urls:
             _check_url(address, server)
-        self._has_own = server.certificate is not None
+        self._has_own, self._was_accepted = server.certificate is not None, False
         self._client = httpx.Client(
             base_url=f"{self._url}/api/v1/",
             headers=dict(headers or {}) | ({"Authorization": f"Bearer {server.token}"} if server.token else {}),
@@ -138,11 +138,13 @@ class HttpClient:
     def _checked(self, response: "httpx.Response", passes: Collection[int]) -> "httpx.Response":
         code = response.status_code
         if code == 200 or code in passes:
+            self._was_accepted = True
             return response
         after = response.headers.get("Retry-After", "")
         wait_s = float(after) if after.isascii() and after.isdigit() else 0.0
         is_other_agent = code == 409 and "index" not in _detail(response)  # another agent may stop soon
-        if code in _LATER or is_other_agent:
+        are_tokens_changing = code == 401 and self._was_accepted  # the token was good before, and may be again
+        if code in _LATER or is_other_agent or are_tokens_changing:
             raise UnavailableError(self._reason(response), wait_s)
         raise (OversizeError if code == 413 else CloudError)(self._reason(response))
 
@@ -258,6 +260,8 @@ def _detail(response: "httpx.Response") -> dict[str, Any]:
 
 
 def _check_url(url: str, server: Server) -> None:
+    if "@" in url:
+        raise CloudError("the address of a cloud has no user name and no password; remove all up to the @")
     try:
         parts = urlsplit(url)
         is_address = parts.scheme in ("http", "https") and parts.port != 0 and not any(map(str.isspace, url))

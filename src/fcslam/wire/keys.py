@@ -29,7 +29,7 @@ class Server:
 
     def __post_init__(self) -> None:
         if self.budget_kBps is not None and not self.budget_kBps > 0.0:
-            raise InputError(f"{self.url}: budget_kBps={self.budget_kBps}; give a number above 0, or None for no limit")
+            raise InputError(f"budget_kBps={self.budget_kBps}; give a number above 0, or None for no limit")
 
 
 def read_server(url: str, folder: Path | None, budget_kBps: float | None = None) -> Server:
