@@ -88,19 +88,12 @@ def imported_modules(tree: ast.AST, package: list[str]) -> Iterator[str]:
         yield from (name for name in names if name.split(".")[0] == "fcslam" and not name.endswith(".__version__"))
 
 
-def is_type_checking(statement: ast.stmt) -> bool:
-    return isinstance(statement, ast.If) and ast.unparse(statement.test) == "TYPE_CHECKING"
-
-
 def violations(source: str, path: Path) -> list[str]:
     parts = ["fcslam", *path.with_suffix("").parts]
     package = parts[:-1]
     room = room_of(".".join(package if path.name == "__init__.py" else parts))
-    tree = ast.parse(source)
-    if not room:  # the public names of the package: type checkers see them, the interpreter imports them late
-        tree.body = [statement for statement in tree.body if not is_type_checking(statement)]
-    seen = {room_of(module) for module in imported_modules(tree, package)}
-    may = allowed(room) if room else {"", "errors"}
+    seen = {room_of(module) for module in imported_modules(ast.parse(source), package)}
+    may = allowed(room) if room else {""}  # public names are imported late
     return [f"{path}: {room or 'fcslam'} imports {other}" for other in sorted(seen - may)]
 
 

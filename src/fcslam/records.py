@@ -418,6 +418,10 @@ class Place:
     """Shape (N, 32)."""
 
 
+MOST_NETWORK_BYTES = 64 * 1024 * 1024
+"""Largest file of a detector; present ones have 0.5 to 5 MB."""
+
+
 @dataclass(frozen=True, slots=True)
 class DetectorFile:
     """Description of a network file that robots can download."""

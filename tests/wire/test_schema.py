@@ -11,7 +11,7 @@ from google.protobuf.descriptor import FieldDescriptor
 
 from fcslam.errors import PacketError
 from fcslam.geometry.voxels import MOST_POINTS
-from fcslam.records import PLACE_CHANNELS, ConstraintKind
+from fcslam.records import MOST_NETWORK_BYTES, PLACE_CHANNELS, ConstraintKind
 from fcslam.wire import fcslam_pb2 as pb
 from fcslam.wire import limits
 from fcslam.wire.packets import decode, encode
@@ -159,7 +159,7 @@ def test_the_documents_name_every_field_and_limit():
         limits.MAXIMUM_PACKET_BYTES,
         limits.MAXIMUM_BEAMS,
         limits.MAXIMUM_KEYPOINTS,
-        limits.MAXIMUM_NETWORK_BYTES,
+        MOST_NETWORK_BYTES,
         MOST_POINTS,
     ):
         assert str(number) in plain

@@ -18,12 +18,12 @@ from google.protobuf.message import DecodeError
 from fcslam.config import one_line
 from fcslam.errors import FeatureError
 from fcslam.processes import run_module
+from fcslam.records import MOST_NETWORK_BYTES
 from fcslam.untrusted import read_bytes
 
-MOST_FILE_BYTES: Final = 1 << 26
 MOST_NODES: Final = 2000
 MOST_ATTRIBUTES: Final = 20 * MOST_NODES
-MOST_ELEMENTS: Final = MOST_FILE_BYTES // 4
+MOST_ELEMENTS: Final = MOST_NETWORK_BYTES // 4
 """Numbers in one array of weights."""
 TRIAL_MEMORY_BYTES: Final = 400_000_000
 """Memory of a run on an image of ``TRIAL_SHAPE``; the paper's network needs 60 MB."""
@@ -89,7 +89,7 @@ def check_network(path: Path) -> None:
         FeatureError: it is not like the networks of this project, or takes too much memory or time.
     """
     try:
-        content = read_bytes(path, most=MOST_FILE_BYTES)
+        content = read_bytes(path, most=MOST_NETWORK_BYTES)
         model = _model().FromString(content)
     except (OSError, DecodeError) as error:
         raise FeatureError(f"{path}: not an ONNX network ({error}); give weights of an fcslam detector") from error

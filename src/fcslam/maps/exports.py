@@ -20,8 +20,6 @@ _TRANSFORMATION, _KEYS, _NUMBERS = 34264, 34735, 34736
 """Tags of GeoTIFF: from pixels to coordinates, the coordinate system, and numbers that it refers to."""
 _SMOOTHED_CELLS = 0.7
 """Outlines leave the cells' corners by less."""
-_SHORT, _DOUBLE = 3, 12
-"""Types of values in TIFF."""
 
 
 class EarthFrame(BaseModel):
@@ -117,7 +115,7 @@ def geotiff(occupancy: OccupancyMap, frame: EarthFrame) -> bytes:
     Its coordinate system is a transverse Mercator projection around the origin of the map's frame (WGS 84, scale 1), so
     coordinates are metres to the east and north of this origin.
     """
-    from PIL import Image, TiffImagePlugin
+    from PIL import Image, TiffImagePlugin, TiffTags
 
     side, (x, y) = occupancy.resolution_m, occupancy.origin_xy
     turn = math.radians(frame.x_axis_from_east_deg)
@@ -148,9 +146,9 @@ def geotiff(occupancy: OccupancyMap, frame: EarthFrame) -> bytes:
     )
     tags = TiffImagePlugin.ImageFileDirectory_v2()
     for tag, kind, values in (
-        (_TRANSFORMATION, _DOUBLE, tuple(affine.ravel().tolist())),
-        (_NUMBERS, _DOUBLE, numbers),
-        (_KEYS, _SHORT, sum(keys, ())),
+        (_TRANSFORMATION, TiffTags.DOUBLE, tuple(affine.ravel().tolist())),
+        (_NUMBERS, TiffTags.DOUBLE, numbers),
+        (_KEYS, TiffTags.SHORT, sum(keys, ())),
     ):
         tags.tagtype[tag] = kind
         tags[tag] = values

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
 from fcslam.geometry import se3
+from fcslam.geometry.voxels import VOXEL_STEPS
 from fcslam.maps.occupancy_map import FARTHEST_M
-from fcslam.records import FloatArray, VoxelMap
+from fcslam.records import STEP_M, FloatArray, VoxelMap
 
-_CELL_M: Final = 0.1
+_CELL_M: Final = VOXEL_STEPS * STEP_M
 _NEIGHBOURS: Final = 12
 """Points that give the direction of a surface."""
 _AT_ONCE: Final = 50_000

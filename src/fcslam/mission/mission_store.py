@@ -38,6 +38,7 @@ from fcslam.storage.database import Database, check_file, translate_errors
 from fcslam.storage.row_store import RowStore, StoreTable, Transaction, all_rows, change_rows
 from fcslam.untrusted import check_unpacked, open_database, unpack
 from fcslam.wire.ledger import Ledger, Traffic
+from fcslam.wire.limits import MAXIMUM_BATCH_PACKETS
 from fcslam.wire.messages import Hello, PacketKind
 from fcslam.wire.packets import Label, decode
 
@@ -61,8 +62,6 @@ NEARBY_S = 1.0
 """An edit may name a moment this far outside of a session: stamps are rounded when they are printed."""
 _AT_ONCE = 10_000
 """Packets that are read at once."""
-_ASKED_AT_ONCE = 1024
-"""Packets whose numbers are looked up at once: those of one batch."""
 _COLUMNS = "robot, epoch, sequence, time, kind, channel, data, refusal"
 
 SCHEMA = """
@@ -543,8 +542,8 @@ def _found(
     query: Callable[[str, Sequence[object]], Iterable[Any]], numbers: Sequence[tuple[str, int, int]]
 ) -> dict[tuple[str, int, int], StoredPacket]:
     found: dict[tuple[str, int, int], StoredPacket] = {}
-    for begin in range(0, len(numbers), _ASKED_AT_ONCE):
-        asked = numbers[begin : begin + _ASKED_AT_ONCE]
+    for begin in range(0, len(numbers), MAXIMUM_BATCH_PACKETS):
+        asked = numbers[begin : begin + MAXIMUM_BATCH_PACKETS]
         marks = ", ".join("(?, ?, ?)" for _ in asked)
         # A join, because SQLite uses no index for "(...) IN (VALUES ...)" and would read all packets.
         statement = (

@@ -24,11 +24,10 @@ from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.frontiers import Explorer, Frontier, frontiers
 from fcslam.maps.joint_tiles import TileBatch, TileHistory, frame_of
 from fcslam.maps.occupancy_map import OccupancyMap
+from fcslam.metrics.trajectory import LARGEST_SPEED_M_S
 from fcslam.runs.folder import identity
 from fcslam.storage.files import write_file
 
-LONGEST_SPEED_MPS = 3.0
-"""A robot that says it is farther from its newest keyscan than it can drive at this speed is where the keyscan was."""
 ASSIGN_EVERY_S = 5.0
 """Least time between two assignments of frontiers."""
 ASSIGN_SHARE = 0.1
@@ -175,7 +174,7 @@ class ServedJointMaps:
         """
         number, pose, said_s = self._live.get(session.robot, (-1, session.pose, 0.0))
         if number == session.map and 0.0 < session.heard_s <= said_s:
-            reach_m = 1.0 + LONGEST_SPEED_MPS * (said_s - session.heard_s)
+            reach_m = 1.0 + LARGEST_SPEED_M_S * (said_s - session.heard_s)
             if math.dist(pose[:2], session.pose[:2]) <= reach_m:
                 return pose, said_s
         return session.pose, session.heard_s

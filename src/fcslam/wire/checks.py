@@ -13,6 +13,7 @@ from fcslam.geometry.voxels import MOST_POINTS, are_inside, voxel_keys
 from fcslam.records import (
     CODE_BYTES,
     FLOOR,
+    MOST_NETWORK_BYTES,
     NAME,
     Beams,
     Constraint,
@@ -58,7 +59,7 @@ _BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
     },
     Correction: {"version": _NUMBER, "map_index": _NUMBER, "quality": (0.0, 1.0)},
     Acknowledgement: {"epoch": _EPOCH, "sequence": _SEQUENCE},
-    DetectorUpdate: {"file.format": _NUMBER, "file.size": (1, limits.MAXIMUM_NETWORK_BYTES)},
+    DetectorUpdate: {"file.format": _NUMBER, "file.size": (1, MOST_NETWORK_BYTES)},
 }
 """Lowest and highest value of each number of a record."""
 _MOST_MOTION = 50.0, 500.0

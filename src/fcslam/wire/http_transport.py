@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
 from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
-from fcslam.records import Channel
+from fcslam.records import MOST_NETWORK_BYTES, Channel
 from fcslam.wire.batches import (
     AGENT_HEADER,
     CORRECTION_HEADER,
@@ -22,7 +22,6 @@ from fcslam.wire.batches import (
     write_batch,
 )
 from fcslam.wire.keys import Server, no_passphrase
-from fcslam.wire.limits import MAXIMUM_NETWORK_BYTES
 
 if TYPE_CHECKING:
     import httpx
@@ -65,7 +64,7 @@ class HttpClient:
 
     received_bytes = 0
     """Bytes of the replies' bodies so far."""
-    most_reply_bytes = 4 * MAXIMUM_NETWORK_BYTES
+    most_reply_bytes = 4 * MOST_NETWORK_BYTES
     """A longer reply is not read: a map of 16,000 by 16,000 cells has as many bytes."""
 
     def __init__(self, server: Server, headers: Mapping[str, str] | None = None) -> None:

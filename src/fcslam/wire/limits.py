@@ -27,8 +27,6 @@ BYTES_PER_POINT = 5
 MAXIMUM_ORIGINS = 256
 """Positions of the scanner in a voxel map."""
 
-MAXIMUM_NETWORK_BYTES = 64 * 1024 * 1024
-"""Largest file of a detector; present ones have 0.5 to 5 MB."""
 MAXIMUM_COORDINATE_M = 1e6
 MAXIMUM_LASER_RANGE_M = 1e3
 MAXIMUM_INFORMATION = 2.0**40

@@ -12,14 +12,13 @@ from starlette.concurrency import run_in_threadpool
 from fcslam.cloud.edits import read_edit
 from fcslam.config import StrictModel
 from fcslam.errors import InputError, StoreError
-from fcslam.records import Change, Undo
+from fcslam.records import MOST_NETWORK_BYTES, Change, Undo
 from fcslam.service.authentication import Role
 from fcslam.service.http.fleet import LOOK_S, edit_summary
 from fcslam.service.http.limits import json_body, read_body, read_json
 from fcslam.service.http.responses import DetectorSummary, EditSummary, Finalized, content, refusals
 from fcslam.service.http.robots import NETWORK
 from fcslam.service.http.state import ServiceState
-from fcslam.wire.limits import MAXIMUM_NETWORK_BYTES
 
 LEAST_FREE_BYTES = 8 * 2**20
 """A disk with less is full: neither a result nor the reason for a failure can be written reliably."""
@@ -89,7 +88,7 @@ def administration_router(state: ServiceState) -> APIRouter:
     )
     async def announce_detector(request: Request) -> DetectorSummary:
         """Add a network (ONNX) and announce it to every robot that has a camera and uses another one."""
-        content = await read_body(request, MAXIMUM_NETWORK_BYTES)
+        content = await read_body(request, MOST_NETWORK_BYTES)
         file = await run_in_threadpool(state.missions.detectors.announce, content)
         return DetectorSummary(channel=file.channel, version=file.version, announced=True)
 
