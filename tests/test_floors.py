@@ -9,7 +9,7 @@ import fcslam
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.settings import FleetConfig
-from fcslam.errors import InputError, PacketError, SourceError
+from fcslam.errors import PacketError, SourceError
 from fcslam.mission.localization import read_map
 from fcslam.records import LaserScan
 from fcslam.runs import open_run, separations
@@ -90,14 +90,6 @@ def test_a_robot_is_localized_in_the_map_of_its_floor(mapped):
             read_map(place, "3")
     with pytest.raises(SourceError, match="leave the floor out"):
         read_map(whole / "map.yaml", "1")
-
-
-@pytest.mark.parametrize(
-    ("floors", "reason"), [({"x": "1"}, "a floor names 'x'"), ("first floor", "floor 'first floor' is not 1 to 16")]
-)
-def test_floors_that_cannot_be(logs, floors, reason):
-    with pytest.raises(InputError, match=reason):
-        fcslam.map_recordings(logs[:1], floors=floors)
 
 
 def test_a_recording_has_several_floors(logs, tmp_path):

@@ -10,7 +10,6 @@ import pytest
 from fcslam.anchoring.anchors import Anchors, anchored, anchoring_lines, read_anchors
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
-from fcslam.anchoring.walls import wall_direction
 from fcslam.cloud.report import fuse_members
 from fcslam.config import parse_yaml
 from fcslam.errors import SourceError
@@ -124,14 +123,6 @@ def test_walls_that_moved_are_gone_or_are_new_are_listed():
 
 def test_walls_of_the_plan_that_stand_are_no_deviations():
     assert report_of(placed(mapped()[0], plan_of()))["deviations"] == []
-
-
-def test_the_walls_of_a_map_show_how_it_is_turned():
-    result, _ = mapped((3.0, -2.0, 0.3))
-    (robot,) = result.robots
-    walls_rad = wall_direction(fuse_members([robot], OccupancyConfig()))
-    turned = robot.T_map_base[0, 2] - walls_rad  # the robot begins along the walls
-    assert (turned + np.pi / 4) % (np.pi / 2) - np.pi / 4 == pytest.approx(0.0, abs=0.005)
 
 
 def picture(folder, colours=((255, 255, 255), (0, 0, 0)), name="plan.png"):

@@ -1,7 +1,6 @@
 """The page in a real browser, in front of a real service: what a person sees, clicks and types."""
 
 import asyncio
-import gzip
 import json
 import os
 import re
@@ -25,7 +24,6 @@ from fcslam.geometry import se3
 from fcslam.maps.joint_voxels import ply_of
 from fcslam.maps.occupancy_map import parse_map
 from fcslam.maps.palette import APPEARED, FLOOR, ROBOTS, WALL
-from fcslam.page import ASSETS
 from fcslam.page.report import ShownRun, report_html
 from fcslam.records import KeyscanId, VoxelMap
 from tests.cli.test_serve import API, Service, send
@@ -40,7 +38,6 @@ AXE = Path(os.environ.get("FCSLAM_AXE", ".venv/axe/package/axe.min.js"))
 MOVED = 0x6A1B9A
 """Colour of a wall that is elsewhere in the floor plan, on a light page."""
 WAIT_MS = 60_000
-WHOLE_PAGE_BYTES = 60_000
 ROUNDS = """round,version,released,robots,left_out,loss_triplet,mma_3px
 1,a,0,anna | bob,,0.5,0.25
 2,b,1,anna,bob: too late,0.25,0.375
@@ -539,10 +536,6 @@ def test_a_robot_with_a_hostile_name_is_text(page, mapped):
     says(page, "#facts-of-closure", evil)
     assert page.evaluate("window.evil") is None
     assert page.locator("main img, main script").count() == 0
-
-
-def test_the_page_is_small():
-    assert sum(len(gzip.compress(path.read_bytes())) for path in ASSETS.iterdir()) < WHOLE_PAGE_BYTES
 
 
 def test_axe_finds_no_fault(browser, mapped):

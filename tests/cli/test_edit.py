@@ -173,11 +173,9 @@ def test_the_list_says_who_did_what_and_what_was_undone(run, capsys):
 
 
 BAD = {
-    "a session that is not there": ("veto", "nobody", "robot1"),
     "a stamp that is not there": ("pin", "robot1", "1e9", "robot2", "0"),
     "a closure that is not there": ("veto", "robot1", "0.001", "robot2", "0.001"),
     "half a closure": ("veto", "robot1", "1.0", "robot2"),
-    "no edit of this number": ("undo", "7"),
     "a session to remove that is not there": ("remove", "robot1+7"),
     "a stretch without numbers": ("remove", "robot1", "--from", "nan"),
     "no corner": ("erase", ""),
@@ -223,7 +221,6 @@ def arguments_of(argument, names):
 def test_what_is_drawn_needs_the_run_folder(run, tmp_path, refused):
     shutil.copy(run / "mission.fcslam", tmp_path / "alone.fcslam")
     assert "give the run folder" in refused("edit", "erase", tmp_path / "alone.fcslam", "1,2 3,4")
-    assert "no recording is given" in refused("map", "-o", tmp_path / "new")
 
 
 def test_of_people_who_edit_at_once_nobody_loses_an_edit(run):

@@ -96,7 +96,6 @@ def test_a_2d_recording_in_3d_is_told_what_its_laser_does(log, cloud, tmp_path, 
             ["--server", "https://localhost", "--credentials", "{client.pem: x, client.key: x}"],
             "cannot read the certificate and its key",
         ),
-        (["--state", "/dev/null/state"], "cannot be made"),
         (["--credentials", "{ca.pem: x}"], "cannot read a certificate authority"),
     ],
 )

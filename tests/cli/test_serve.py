@@ -105,7 +105,6 @@ def test_tokens_that_are_all_there_are_not_written_again(tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        (["--credentials", 300 * "x"], "holds neither tokens.yaml nor cloud.pem"),
         (["--credentials", "half"], "belong together"),
         (["--credentials", "bad"], "cloud.pem"),
         (["--client-ca", "ca.pem"], "--credentials with cloud.pem"),

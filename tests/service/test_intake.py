@@ -262,9 +262,3 @@ def test_of_a_robot_with_too_many_refused_packets_no_more_are_stored_and_a_line_
     assert len(desk.store.envelopes()) == 3
     assert desk.take(*other_robot(2), robot="b") == [Acknowledgement("b", 0, 1)]
     assert desk.take() == [], "it may ask"
-
-
-@pytest.mark.parametrize("name", ["a+1", "a+12"])
-def test_a_robot_that_is_called_like_a_session_is_refused(desk, name):
-    with pytest.raises(PacketError, match="session of 'a'"):
-        desk.take(robot=name)

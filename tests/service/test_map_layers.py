@@ -10,9 +10,9 @@ import pytest
 from fcslam import untrusted
 from fcslam.errors import InputError
 from fcslam.maps.exports import outlines
-from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
+from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.page.report import ShownRun
-from fcslam.service.map_layers import MOST_LAYER_BYTES, MapLayer, layers_of, map_shapes, walls_of
+from fcslam.service.map_layers import MOST_LAYER_BYTES, MapLayer, layers_of, map_shapes
 from tests.mission.test_map_changes import write_run
 
 PLAN = {
@@ -149,13 +149,3 @@ def test_outlines_run_through_the_middles_of_cells_and_around_holes():
     found = points(path)
     assert found.min(axis=0).tolist() == [0.75, 3.25]
     assert found.max(axis=0).tolist() == [3.25, 5.75]
-
-
-def test_the_direction_of_walls_is_that_of_the_drawn_line(tmp_path):
-    cells = np.full((200, 200), Occupancy.FREE, np.uint8)
-    across = np.arange(1000) / 1000 * 190
-    cells[np.round(across * np.tan(0.2)).astype(int), np.round(across).astype(int)] = Occupancy.OCCUPIED
-    occupancy = OccupancyMap(cells, 0.05, (0.0, 0.0))
-    (tmp_path / "map.pgm").write_bytes(pgm_bytes(occupancy))
-    (tmp_path / "map.yaml").write_text(map_yaml(occupancy, "map.pgm"))
-    assert walls_of(tmp_path, 0)["direction_rad"] == pytest.approx(0.2, abs=0.01)

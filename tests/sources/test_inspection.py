@@ -2,7 +2,6 @@
 
 import pytest
 
-from fcslam.errors import SourceError
 from fcslam.sources import BagOptions, write_bag
 from fcslam.sources.inspection import inspect
 from tests.sources import camera_records, carmen_text
@@ -53,11 +52,3 @@ def test_a_log_has_no_topics_and_a_bag_shows_its_camera(tmp_path):
     found = inspect(tmp_path / "run.mcap")
     assert (found.format, found.scans, found.images, found.odometry) == ("ROS bag", 20, 20, 20)
     assert found.camera == camera_records.CAMERA
-
-
-def test_what_is_no_recording_is_refused(tmp_path):
-    (tmp_path / "letter.txt").write_text("dear reader\n")
-    with pytest.raises(SourceError, match="not a recording of a known format"):
-        inspect(tmp_path / "letter.txt")
-    with pytest.raises(SourceError):
-        inspect(tmp_path / "nowhere.bag")
