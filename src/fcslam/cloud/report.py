@@ -229,7 +229,7 @@ def _certificates(
     for k, fused in maps.items():
         members = [robot for robot in result.robots if robot.map_index == k and len(robot.stamps)]
         if members and fused.cells.any() and (k == 0 or sum(len(robot.stamps) for robot in members) >= LEAST_DRAWN):
-            paths = [MappedPath(robot.robot, robot.stamps, robot.T_map_base, robot.variables) for robot in members]
+            paths = [MappedPath(robot.T_map_base, robot.variables) for robot in members]
             certificates[k] = certify(result.graph, paths, fused, robot_radius_m=robot_radius_m)
     return certificates
 

@@ -3,7 +3,8 @@
 The error of a place is the root mean square distance of the places around it from the truth, after the best rigid
 alignment of both: distances on the map within the surroundings are that wrong. The covariances of the graph give its
 expectation, but not its size, because no measurement counts as more precise than scan matching at its worst. What the
-measurements leave as residuals gives the size. ``QUANTILE`` was chosen on maps of published floors.
+measurements leave as residuals gives the size. Wheels that slip where the scans do not see it leave none, so there the
+size grows with what rests on the wheels alone. ``QUANTILE`` was chosen on maps of published floors.
 ``benchmarks/certificate.py`` measures how often the bound holds, and the conformal quantile without each building.
 """
 
@@ -19,6 +20,8 @@ from fcslam.geometry import se2
 from fcslam.geometry.groups import SE2
 from fcslam.graph.cholesky import find_structure, marginal_covariance
 from fcslam.graph.pose_graph import Edge, EdgeArrays, PoseGraph
+from fcslam.lidar.evidence import SIGMA_PER_TURN
+from fcslam.lidar.frontend import ODOMETRY_SIGMA_M
 from fcslam.maps.frontiers import frontiers
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray
@@ -26,7 +29,9 @@ from fcslam.records import FloatArray
 QUIET: Final = 0.1
 """Ratio of true errors to the standard deviations of the graph where its edges leave no residuals. Their root mean
 square, 1 if the measurements scatter as the graph expects, is added in quadrature."""
-QUANTILE: Final = 4.3
+UNSEEN: Final = 0.5
+"""The same ratio where scans see nothing of a motion, so that slips of the wheels leave no residuals."""
+QUANTILE: Final = 3.6
 """Ratio of the error that 95 % of the cells of a map stay below to the expected one, in most maps."""
 WITHIN_M: Final = 10.0
 CELL_M: Final = 1.0
@@ -46,9 +51,6 @@ _S: Final = np.array(((0.0, -1.0), (1.0, 0.0)))
 class MappedPath(NamedTuple):
     """The keyscans of one session."""
 
-    session: str
-    stamps: FloatArray
-    """Shape (N,), seconds."""
     T_map_base: FloatArray
     """Shape (N, 3)."""
     variables: NDArray[np.int64]
@@ -143,24 +145,31 @@ def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
     in_bases = marginal_covariance(structure, jacobians, part.information, held, chosen).reshape(len(chosen), 3, -1, 3)
     turn = se2.adjoint(poses[chosen] * (0.0, 0.0, 1.0))
     covariance = np.einsum("pab,pbqc,qdc->paqd", turn, in_bases, turn, optimize=True).reshape(3 * len(chosen), -1)
-    scale = np.hypot(QUIET, _contradiction(graph, rows, poses, chosen))
-    return Places(variables[chosen], poses[chosen], covariance, scale, _drift(part, poses, chosen))
+    drift, unseen = _path_near(part, poses, chosen)
+    scale = np.sqrt(QUIET**2 + _contradiction(graph, rows, poses, chosen) ** 2 + (UNSEEN * unseen) ** 2)
+    return Places(variables[chosen], poses[chosen], covariance, scale, drift)
 
 
-def _drift(edges: EdgeArrays, poses: FloatArray, chosen: NDArray[np.int64]) -> FloatArray:
-    """Covariance that a metre of the path adds at the chosen poses, along the axes of ``map``, shape (P, 3, 3).
+def _path_near(edges: EdgeArrays, poses: FloatArray, chosen: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """Of the path around the chosen poses: what a metre adds, and what the scans do not see of it.
 
-    It is the mean over the steps of the path within ``WITHIN_M``, or that of the nearest step.
+    The covariance that a metre adds along the axes of ``map``, shape (P, 3, 3); and the square of the largest variance
+    of a step's position in that of the wheels alone, 1 at most, shape (P,). Both are means over the steps within
+    ``WITHIN_M``, or those of the nearest step.
     """
     steps = np.flatnonzero((edges.j == edges.i + 1) & (np.hypot(*edges.T_i_j[:, :2].T) > 1e-3))
     if not len(steps):
-        return np.zeros((len(chosen), 3, 3))
+        return np.zeros((len(chosen), 3, 3)), np.zeros(len(chosen))
     turn = se2.adjoint(poses[edges.j[steps]] * (0.0, 0.0, 1.0))
     length_m = np.hypot(*edges.T_i_j[steps, :2].T)
-    added = turn @ np.linalg.inv(edges.information[steps]) @ turn.swapaxes(1, 2) / length_m[:, None, None]
+    covariance = np.linalg.inv(edges.information[steps])
+    added = turn @ covariance @ turn.swapaxes(1, 2) / length_m[:, None, None]
+    share = np.linalg.eigvalsh(covariance[:, :2, :2])[:, 1] / (ODOMETRY_SIGMA_M + SIGMA_PER_TURN * length_m) ** 2
     apart_m = np.array([_distances(poses[edges.j[steps]], place) for place in poses[chosen]])
     near = apart_m <= np.maximum(WITHIN_M, apart_m.min(axis=1, keepdims=True))
-    return np.asarray(near @ added.reshape(-1, 9) / near.sum(axis=1, keepdims=True)).reshape(-1, 3, 3)
+    values = np.column_stack((added.reshape(-1, 9), np.minimum(share, 1.0) ** 2))
+    means = near @ values / near.sum(axis=1, keepdims=True)
+    return means[:, :9].reshape(-1, 3, 3), means[:, 9]
 
 
 def _contradiction(
