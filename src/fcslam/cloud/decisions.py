@@ -23,7 +23,7 @@ from fcslam.cloud.space import Space
 from fcslam.geometry import se2
 from fcslam.graph.cluster import ClusterDecision
 from fcslam.graph.evidence import AGREES_M, AGREES_RAD, ClusterEvidence
-from fcslam.lidar.scan import PointScan, keyscan_points
+from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import build_submap
 from fcslam.lidar.verification import verify
 from fcslam.places.matcher import PlaceMatch
@@ -245,10 +245,7 @@ class ClosureDecisions(Kept):
 
     def _scans(self, end: KeyscanId) -> Scans:
         first, last = max(end.number - REFINED_KEYSCANS, 0), end.number + REFINED_KEYSCANS
-        poses, lasers = self._graph.chain(end.robot, first, last), self._sessions.lasers(end.robot)
-        in_plane = self._space.chain_in_plane(end, poses[end.number - first], poses)
-        keyscans = self._sessions.keyscans(end.robot, first, first + len(poses) - 1)
-        return [(keyscan_points(k, lasers), in_plane[k.id.number - first]) for k in keyscans]
+        return self._space.scans(end, first, self._graph.chain(end.robot, first, last))
 
     def _accept_if_consistent(self, entry: ClosureEntry) -> bool:
         """Accept a verified closure that fits the joint map; False if only a cluster may accept it."""

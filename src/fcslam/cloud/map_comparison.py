@@ -1,6 +1,7 @@
 """Comparison of the maps of two sessions: exhaustive around the places that match, or where a joint map lays them."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -14,7 +15,7 @@ from fcslam.graph.evidence import AGREES_M, AGREES_RAD, LARGEST_CONTRADICTION, L
 from fcslam.graph.trajectory import Trajectory
 from fcslam.lidar.map_agreement import PlaceAgreement
 from fcslam.places.local_maps import LocalMaps, SeenKeyscans
-from fcslam.records import FloatArray, KeyscanId, frozen
+from fcslam.records import FloatArray, frozen
 from fcslam.storage.snapshot import Kept
 
 GROWTH = 1.5
@@ -30,8 +31,10 @@ RIVALS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Compared:
-    i: KeyscanId
-    j: KeyscanId
+    i: int
+    """Keyscan of the first session."""
+    j: int
+    """Keyscan of the second one."""
     T_i_j: FloatArray
     """Pose of keyscan j in keyscan i, shape (3,), by the transform that was compared."""
     keyscans: int
@@ -103,7 +106,7 @@ class MapComparison(Kept):
     def _is_at(compared: _Compared, a: Trajectory, b: Trajectory, T_a_b: FloatArray) -> bool:
         from fcslam.lidar.uniqueness import is_elsewhere
 
-        T_i_j = _between(a.poses[compared.i.number], T_a_b, b.poses[compared.j.number])
+        T_i_j = _between(a.poses[compared.i], T_a_b, b.poses[compared.j])
         return not is_elsewhere(T_i_j, compared.T_i_j, np.zeros((1, 2)))
 
     def _compare(
@@ -127,14 +130,14 @@ class MapComparison(Kept):
             return replace(earlier, closures=len(members), size=len(a) + len(b))
         if not keyscans:
             return None
-        frames, T_a_i, T_b_j = local_frames(a, b, members), a.poses[i.number], b.poses[j.number]
+        frames, T_a_i, T_b_j = local_frames(a, b, members), a.poses[i], b.poses[j]
         T_i_j, fit = _between(T_a_i, T_a_b, T_b_j), _fit(local_maps.agreement(frames))
         if refutation(fit) is None:
             fit = replace(fit, seen_through=self._space.seen_through(sessions, a.poses, b.poses, frames))
         is_searched = refutation(fit) is not None  # then no transform elsewhere matters
         if not is_searched and may_decide(fit):
             is_searched = True
-            whole_a, whole_b = local_maps.whole(0, near_a, i.number), local_maps.whole(1, near_b, j.number)
+            whole_a, whole_b = local_maps.whole(0, near_a, i), local_maps.whole(1, near_b, j)
             best = align_map(whole_a, whole_b, T_i_j)
             fit = replace(fit, seen_m=best.known_m)
             found_elsewhere = alignments(whole_a, whole_b, best.T_a_b, parallel_headings(whole_a, whole_b))
@@ -161,13 +164,14 @@ class MapComparison(Kept):
         apart_m, _ = cKDTree(poses_a[:, : group.axes]).query(poses_b[:, : group.axes])
         middle = poses_b[np.argmin(apart_m), : group.axes]
         (near_a, i, _), (near_b, j, _) = local_maps.around(0, middle), local_maps.around(1, middle)
-        if not near_a or not near_b:
+        if not len(near_a) or not len(near_b):
             return 0.0
-        whole_a, whole_b = local_maps.whole(0, near_a, i.number), local_maps.whole(1, near_b, j.number)
-        return align_map(whole_a, whole_b, _between(poses_a[i.number], group.identity, poses_b[j.number])).known_m
+        whole_a, whole_b = local_maps.whole(0, near_a, i), local_maps.whole(1, near_b, j)
+        return align_map(whole_a, whole_b, _between(poses_a[i], group.identity, poses_b[j])).known_m
 
     def _local_maps(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> LocalMaps:
-        a, b = (SeenKeyscans(self._sessions.keyscans(name), self._sessions.lasers(name)) for name in sessions)
+        store = self._sessions
+        a, b = (SeenKeyscans(store.numbers(session), partial(store.scan, session)) for session in sessions)
         return LocalMaps((a, b), (poses_a, poses_b), (AGREES_M, AGREES_RAD))
 
 

@@ -74,7 +74,7 @@ class PlaceRecognition:
         self._space = space
         self._closures = closures
         self._verify_pairs = verify_pairs
-        self.submaps = SubmapCache(sessions, graph, space, config.submaps_kept)
+        self.submaps = SubmapCache(graph, space, config.submaps_kept)
         self._matchers: dict[_VocabularyKey, PlaceMatcher] = {}
         self._places: dict[tuple[_VocabularyKey, str], NDArray[np.int64]] = {}
         """Number of the keyscan and of the arrival of each stored place, shape (N, 2), by vocabulary and session."""

@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from functools import lru_cache
+from typing import Any, Final, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.cloud.claims import LONGEST_MOTION_M, ClaimLimits, check_constraint, check_distance, check_voxel_map
 from fcslam.cloud.packet_log import PacketNumber
@@ -12,6 +14,7 @@ from fcslam.cloud.sessions import in_session
 from fcslam.errors import PacketError
 from fcslam.geometry.beams import misfit
 from fcslam.geometry.groups import group_of
+from fcslam.lidar.scan import PointScan, keyscan_points
 from fcslam.records import (
     Channel,
     Constraint,
@@ -27,6 +30,8 @@ from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import State
 from fcslam.wire.messages import Hello, Packet
 
+SCANS_KEPT: Final = 1000
+"""Keyscans that are kept as points, 10 kB each: neighbouring submaps share most of theirs."""
 _Body = TypeVar("_Body", Hello, Keyscan, VoxelMap)
 
 
@@ -94,6 +99,8 @@ class SessionStore:
         """Those that were read."""
         self._unread: list[KeyscanId] = []
         """Keyscans that ``restore`` named; some may have been read since."""
+        self.scan = lru_cache(SCANS_KEPT)(self._read_scan)
+        """The points of a keyscan, by session and number."""
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -226,6 +233,17 @@ class SessionStore:
         end = session.connected if last is None else last + 1
         kept = (self._keyscan(robot, number) for number in range(first, end))
         return tuple(keyscan for keyscan in kept if keyscan is not None)
+
+    def numbers(self, robot: str, first: int = 0, last: int | None = None) -> NDArray[np.int64]:
+        """Numbers of the ``keyscans``, shape (N,)."""
+        session = self._sessions[robot]
+        end = session.connected if last is None else min(last + 1, session.connected)
+        return np.array([k for k in range(first, end) if not session.keyscans[k].is_released], np.int64)
+
+    def _read_scan(self, robot: str, number: int) -> PointScan:
+        keyscan = self._keyscan(robot, number)
+        assert keyscan is not None, "it was released"
+        return keyscan_points(keyscan, self.lasers(robot))
 
     def read_ahead(self, most: int) -> bool:
         """Read up to ``most`` of the keyscans that ``restore`` named, with their voxel maps; False: all are read."""

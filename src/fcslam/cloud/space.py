@@ -13,6 +13,7 @@ from fcslam.cloud.session_store import SessionStore
 from fcslam.errors import PacketError
 from fcslam.geometry import se3
 from fcslam.geometry.groups import SE2, SE3, Group
+from fcslam.lidar.scan import PointScan
 from fcslam.lidar.voxel_matching import PreparedMap, align_maps, disagreement, prepared, seen_through
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import ClosureStatus, Constraint, FloatArray, KeyscanId, Reason, ReasonCode, VoxelMap, frozen
@@ -56,11 +57,17 @@ class Space:
             return T_i_j
         return SE3.to_plane(se3.compose(se3.inverse(self._ground(i)), se3.compose(T_i_j, self._ground(j))))
 
-    def chain_in_plane(self, anchor: KeyscanId, T_odom_anchor: FloatArray, T_odom_base: FloatArray) -> FloatArray:
-        """Poses (N, 3) of keyscans in the plane of an anchor."""
-        if self.group is SE2:
-            return SE2.between(T_odom_anchor, T_odom_base)
-        return SE3.to_plane(se3.between(se3.compose(T_odom_anchor, self._ground(anchor)), T_odom_base))
+    def scans(self, anchor: KeyscanId, first: int, T_odom_base: FloatArray) -> list[tuple[PointScan, FloatArray]]:
+        """Points of the keyscans from ``first`` on that are left, and their poses (3,) in the plane of one of them.
+
+        ``T_odom_base`` (N, P) is that of all of them.
+        """
+        T_odom_anchor, numbers = T_odom_base[anchor.number - first], range(first, first + len(T_odom_base))
+        if self.group is not SE2:
+            T_odom_anchor = se3.compose(T_odom_anchor, self._ground(anchor))
+        poses = self.group.to_plane(self.group.between(T_odom_anchor, T_odom_base))
+        left = self._sessions.numbers(anchor.robot, numbers[0], numbers[-1]).tolist()
+        return [(self._sessions.scan(anchor.robot, number), poses[number - first]) for number in left]
 
     def measured(
         self, i: KeyscanId, j: KeyscanId, T_i_j: FloatArray, information: FloatArray

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from fcslam.cloud.joint_graph import JointGraph
-from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.space import Space
-from fcslam.lidar.scan import PointScan, keyscan_points
+from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import Submap, build_submap, read_submap, self_violation, submap_bytes
 from fcslam.records import Channel, FloatArray, KeyscanId, Place
 
@@ -26,8 +25,7 @@ _Key = tuple[KeyscanId, Channel]
 class SubmapCache:
     """Holds up to ``capacity`` submaps, packed; the least recently used one is dropped first."""
 
-    def __init__(self, sessions: SessionStore, graph: JointGraph, space: Space, capacity: int) -> None:
-        self._sessions = sessions
+    def __init__(self, graph: JointGraph, space: Space, capacity: int) -> None:
         self._graph = graph
         self._space = space
         self._capacity = capacity
@@ -76,8 +74,5 @@ class SubmapCache:
         self._unpacked.pop(key, None)
 
     def _scans(self, place: Place) -> list[tuple[PointScan, FloatArray]]:
-        robot = place.id.robot
-        lasers, anchor = self._sessions.lasers(robot), self._graph.chain(robot, place.id.number, place.id.number)[0]
-        poses = self._space.chain_in_plane(place.id, anchor, self._graph.chain(robot, place.first, place.last))
-        keyscans = self._sessions.keyscans(robot, place.first, place.last)
-        return [(keyscan_points(keyscan, lasers), pose) for keyscan, pose in zip(keyscans, poses, strict=True)]
+        poses = self._graph.chain(place.id.robot, place.first, place.last)
+        return self._space.scans(place.id, place.first, poses)

@@ -84,6 +84,12 @@ class SurfelField:
         field.arrays = arrays
         return field
 
+    def copy(self) -> Self:
+        """A field that takes further scans of its own; this one was not compacted."""
+        copied = self.of(self.arrays._replace(**{name: array.copy() for name, array in self.arrays._asdict().items()}))
+        copied._T_field_last = self._T_field_last
+        return copied
+
     def insert(self, scan: PointScan, T_field_base: FloatArray) -> None:
         """Add a scan taken at ``T_field_base``, shape (3,), metres and radians; drop returns outside the table."""
         done = 0

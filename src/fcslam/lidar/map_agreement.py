@@ -27,7 +27,7 @@ from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.lidar.field import EMPTY, label_at
 from fcslam.lidar.scan import PointScan
-from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, VIOLATION_M, Submap, build_submap, seen_through
+from fcslam.lidar.submap import FREE_CELL_M, SPACING_M, VIOLATION_M, Submap, build_with_halves, seen_through
 from fcslam.records import FloatArray
 
 STRETCH_M: Final = 5.0 * SPACING_M
@@ -107,7 +107,7 @@ class Noise(NamedTuple):
 def local_map(scans: Sequence[tuple[PointScan, FloatArray]], radius_m: float) -> LocalSubmap:
     """The map of at least two scans, as for ``build_submap``."""
     middle = len(scans) // 2
-    whole, first, second = (build_submap(part, radius_m) for part in (scans, scans[:middle], scans[middle:]))
+    whole, first, second = build_with_halves(scans, radius_m)
     compared = [_stretches(first, second, np.zeros(3)), _stretches(second, first, np.zeros(3))]
     offsets_m: FloatArray = np.concatenate([offsets_m for offsets_m, _, _ in compared])
     in_free = max(count / max(1, count + len(offsets_m)) for offsets_m, count, _ in compared)

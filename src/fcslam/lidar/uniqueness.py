@@ -6,7 +6,7 @@ door farther. So this module aligns both maps at every heading and position, and
 the best one elsewhere.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +77,10 @@ def alignments(
     """
     if not len(a.surface) or not len(b.surface):
         return []
+    if _lever_m(a) < _lever_m(b):  # a small map needs fewer headings, and smaller images
+        back = None if T_a_b is None else se2.inverse(T_a_b)
+        turned = alignments(b, a, back, None if headings is None else -headings)
+        return [replace(each, T_a_b=se2.inverse(each.T_a_b)) for each in turned]
     middle = b.surface.points.mean(axis=0, keepdims=True)
     known = [] if T_a_b is None else [T_a_b]
     distinct = [*known]
@@ -116,7 +120,7 @@ def parallel_headings(a: Submap, b: Submap) -> FloatArray:
         directions.append(fft.rfft(np.bincount(np.rint(np.degrees(turn)).astype(np.int64) % 90, minlength=90)))
     blur = np.exp(-2.0 * (np.pi * DIRECTION_DEG * np.arange(46) / 90.0) ** 2)
     parallel = fft.irfft(directions[0] * np.conj(directions[1]) * blur, 90)
-    headings = _half_headings(b.surface.points - b.surface.points.mean(axis=0))
+    headings = _half_headings(min(_lever_m(a), _lever_m(b)))
     share = parallel[np.rint(np.degrees(headings)).astype(np.int64) % 90]
     chosen: FloatArray = headings[share >= PARALLEL_SHARE * share.max()]
     return chosen
@@ -162,7 +166,7 @@ def _coarse_peaks(a: Submap, b: Submap, headings: FloatArray | None = None) -> F
     worth = 2.0 * surface_a * _smear(rows, columns) - VIOLATION_WEIGHT * inside_a  # a surface counts for both maps
     against, product, near = VIOLATION_WEIGHT * surface_a, np.empty_like(surface_a), np.arange(-4, 5)
     found: list[tuple[float, float, int, int]] = []
-    for heading in _half_headings(other[0]) if headings is None else headings:
+    for heading in _half_headings(_lever_m(b)) if headings is None else headings:
         surface_b, inside_b = _spectra(other, heading, (rows, columns))
         for half in (0, 1):
             _correlate(worth, against, surface_b, inside_b, half == 1, product)
@@ -191,9 +195,14 @@ def _correlate(worth, against, surface, inside, half, product):  # type: ignore[
             product[row, k] = worth[row, k] * s - against[row, k] * i
 
 
-def _half_headings(surface: FloatArray) -> FloatArray:
-    """Headings over half a turn at which the far walls of a map move by a cell and a half."""
-    lever_m = float(np.quantile(np.hypot(*surface.T), 0.9))
+def _lever_m(submap: Submap) -> float:
+    """Distance of the far walls of a map from its middle."""
+    points = submap.surface.points
+    return float(np.quantile(np.hypot(*(points - points.mean(axis=0)).T), 0.9))
+
+
+def _half_headings(lever_m: float) -> FloatArray:
+    """Headings over half a turn at which walls so far from the middle move by a cell and a half."""
     count = max(18, int(np.ceil(np.pi * lever_m / (1.5 * CELL_M))))
     return np.asarray(np.arange(count) * (np.pi / count), np.float64)
 

@@ -1,6 +1,6 @@
 """Local maps of two sessions around places that both saw, and how well they agree."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from fcslam.geometry import se2
 from fcslam.geometry.groups import group_of
 from fcslam.lidar.map_agreement import LocalSubmap, Noise, PlaceAgreement, compare, local_map, noise_of, total
-from fcslam.lidar.scan import PointScan, keyscan_points
+from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import Submap, build_submap
-from fcslam.records import FloatArray, Keyscan, KeyscanId, LaserModel
+from fcslam.records import FloatArray
 
 REACH_M = 45.0
 """Keyscans up to this far from the middle of the matching places make a map: of both wings of a building that repeats
@@ -31,14 +31,15 @@ SAME_FLOOR_M = 1.5
 """Keyscans that differ more in height are on two floors, which share no map."""
 MOST_LOCAL_MAPS = 16
 """Most places at which local maps are compared; of more, evenly spaced ones."""
-_NONE = KeyscanId("", -1)
 
 
 class SeenKeyscans(NamedTuple):
-    """The keyscans of a session that are left, and its lasers."""
+    """The keyscans of a session that are left."""
 
-    keyscans: Sequence[Keyscan]
-    lasers: Sequence[LaserModel]
+    numbers: NDArray[np.int64]
+    """Shape (K,), ascending."""
+    scan: Callable[[int], PointScan]
+    """The points of one of them."""
 
 
 class LocalMaps:
@@ -66,32 +67,31 @@ class LocalMaps:
         """Positions (N, A) in which two floors lie as far apart as two places."""
         return poses[:, : self._group.axes] * (1.0, 1.0, LOCAL_RADIUS_M / SAME_FLOOR_M)[: self._group.axes]
 
-    def around(self, side: int, middle: FloatArray) -> tuple[list[Keyscan], KeyscanId, bool]:
+    def around(self, side: int, middle: FloatArray) -> tuple[NDArray[np.int64], int, bool]:
         """The keyscans of a session that are left around a point (A,), the nearest one, and whether none was released
         there."""
         distance_m = self._distance_m(side, middle)
         keyscans = self._keyscans(side, middle, REACH_M, MOST_KEYSCANS)
         is_complete = len(keyscans) >= min(MOST_KEYSCANS, int(np.count_nonzero(distance_m <= REACH_M)))
-        nearest = min((k.id for k in keyscans), key=lambda id_: float(distance_m[id_.number]), default=_NONE)
+        nearest = int(keyscans[np.argmin(distance_m[keyscans])]) if len(keyscans) else -1
         return keyscans, nearest, is_complete
 
-    def whole(self, side: int, keyscans: Sequence[Keyscan], anchor: int) -> Submap:
+    def whole(self, side: int, keyscans: NDArray[np.int64], anchor: int) -> Submap:
         """The map of keyscans ``around`` a point, in the base of one of them."""
         return build_submap(self._scans(side, keyscans, anchor), REACH_M)
 
-    def _scans(self, side: int, keyscans: Sequence[Keyscan], anchor: int) -> list[tuple[PointScan, FloatArray]]:
-        lasers, poses = self._seen[side].lasers, self._in_plane[side]
-        return [(keyscan_points(k, lasers), se2.between(poses[anchor], poses[k.id.number])) for k in keyscans]
+    def _scans(self, side: int, keyscans: NDArray[np.int64], anchor: int) -> list[tuple[PointScan, FloatArray]]:
+        poses = se2.between(self._in_plane[side][anchor], self._in_plane[side][keyscans])
+        return [(self._seen[side].scan(k), pose) for k, pose in zip(keyscans.tolist(), poses, strict=True)]
 
     def _distance_m(self, side: int, middle: FloatArray) -> FloatArray:
         off = self._poses[side][:, : self._group.axes] - middle
         is_on_floor = np.all(np.abs(off[:, 2:]) < SAME_FLOOR_M, axis=1)
         return np.where(is_on_floor, np.hypot(off[:, 0], off[:, 1]), np.inf)
 
-    def _keyscans(self, side: int, middle: FloatArray, reach_m: float, most: int) -> list[Keyscan]:
-        distance_m = self._distance_m(side, middle)
-        near = [k for k in self._seen[side].keyscans if distance_m[k.id.number] <= reach_m]
-        return [near[row] for row in _at_most(np.arange(len(near)), most)]
+    def _keyscans(self, side: int, middle: FloatArray, reach_m: float, most: int) -> NDArray[np.int64]:
+        numbers = self._seen[side].numbers
+        return _at_most(numbers[self._distance_m(side, middle)[numbers] <= reach_m], most)
 
     def agreement(self, T_a_b: FloatArray) -> PlaceAgreement:
         """Compare the local maps of both sessions wherever the first one was near a place of the second.
