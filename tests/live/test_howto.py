@@ -2,7 +2,6 @@
 
 import re
 import sys
-import textwrap
 from pathlib import Path
 from types import ModuleType
 
@@ -20,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 
 def programs():
     text = (ROOT / "docs" / "howto" / "python.md").read_text(encoding="utf-8")
-    return [textwrap.dedent(block) for block in re.findall(r"\n\n((?: {4}.*\n|\n)+)", text)]
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
 @pytest.fixture
