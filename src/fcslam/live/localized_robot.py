@@ -128,7 +128,7 @@ class LocalizedRobot(LiveTracker):
 
     def status(self) -> RobotStatus:
         """Return the state of the robot: whether it knows its pose, and counts since its start."""
-        estimate, failure = self._estimate(), self._frontend.failure
+        estimate, failure = self._estimate(), self._frontend.packets.failure
         broken = f"not localized any more, as the search failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         return RobotStatus(
@@ -236,8 +236,8 @@ class LocalizedRobot(LiveTracker):
             self._event(EventKind.LOCALIZED, f"localized, quality {estimate.quality:.2f}")
         elif estimate is None and was_localized:
             self._event(EventKind.LOST, "not localized any more: the walls are others than in the map")
-        if self._frontend.failure:
-            self._tell_failure(f"not localized from now on, as the search failed: {self._frontend.failure}")
+        if self._frontend.packets.failure:
+            self._tell_failure(f"not localized from now on, as the search failed: {self._frontend.packets.failure}")
 
 
 def _localizer(occupancy: OccupancyMap, initial: FloatArray | None) -> MapLocalizer:

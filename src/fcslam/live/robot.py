@@ -200,7 +200,7 @@ class Robot(LiveTracker):
     def status(self) -> RobotStatus:
         """Return the state of the robot: its place in the map, its connection, and counts since its start."""
         uplink, localizer, tracks = self._uplink, self._map_poses.localizer(self._session), self._frontend.tracks
-        failure = self._frontend.failure
+        failure = self._frontend.packets.failure
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
         status = RobotStatus(
@@ -441,7 +441,7 @@ class Robot(LiveTracker):
         uplink, own = self._uplink, self._own
         unstored, is_full = (0, False) if uplink is None else (uplink.unstored, uplink.outbox.is_full)
         with self._lock:
-            behind = max(self._frontend.backlog, unstored, 0 if own is None else own.backlog) > LARGEST_BACKLOG
+            behind = max(self._frontend.packets.backlog, unstored, 0 if own is None else own.backlog) > LARGEST_BACKLOG
             if behind:
                 self._take(self._frontend.ready())
         return behind or is_full
@@ -459,7 +459,7 @@ class Robot(LiveTracker):
     def _catch_up(self) -> None:
         """Wait, without keeping scans waiting, until the back end has handled everything so far."""
         with self._lock:
-            output = self._frontend.awaited
+            output = self._frontend.packets.newest
         if output is not None:
             wait([output])
         with self._lock:
@@ -535,7 +535,7 @@ class Robot(LiveTracker):
                 self._event(EventKind.FLEET, line)
         if self._own is not None:
             self._own.hand_over(self._newest_s - SEND_INTERVAL_S)
-        broken = self._frontend.failure, None if self._own is None else self._own.failure
+        broken = self._frontend.packets.failure, None if self._own is None else self._own.failure
         for failure in filter(None, broken):
             self._tell_failure(f"no loop closures from now on, as the back end failed: {failure}")
 

@@ -113,7 +113,7 @@ def legs(source: Source, config: RobotConfig, backend: Submit | None = None) -> 
         if isinstance(record, Odometry):
             continue  # scans carry their odometry
         packets += map(measure, robot.process(record))
-        if robot.backlog > MOST_WAITING:
+        if robot.packets.backlog > MOST_WAITING:
             packets += map(measure, robot.ready(wait=True))
         if isinstance(record, LaserScan | CloudScan):
             stamps.append(record.stamp)
@@ -123,8 +123,8 @@ def legs(source: Source, config: RobotConfig, backend: Submit | None = None) -> 
             if next(turns) == 0:
                 trim_memory()
     packets += map(measure, robot.finish())
-    if robot.failure is not None:
-        raise FcslamError(f"{robot.robot}: the process of its back end failed: {robot.failure}")
+    if robot.packets.failure is not None:
+        raise FcslamError(f"{robot.robot}: the process of its back end failed: {robot.packets.failure}")
     faults = source.faults.plus(Fault.ODOMETRY_JUMP, robot.jumps)
     tracks = {session_name(robot.robot, epoch): track_of(poses) for epoch, poses in enumerate(robot.tracks)}
     yield Leg(robot.robot, tuple(packets), tuple(stamps), tracks, faults)

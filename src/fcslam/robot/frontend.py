@@ -134,21 +134,6 @@ class RobotFrontend:
         return self._session.lidar.travel_m
 
     @property
-    def backlog(self) -> int:
-        """Number of inputs that the back end has not handled yet."""
-        return self.packets.backlog
-
-    @property
-    def failure(self) -> str | None:
-        """Why the back end ended early; None if it works."""
-        return self.packets.failure
-
-    @property
-    def awaited(self) -> "Future[list[Body]] | None":
-        """Done when the back end has handled everything so far; None if it has."""
-        return self.packets.newest
-
-    @property
     def jumps(self) -> int:
         """Jumps of the odometry that were bridged."""
         return self.odometry.jumps

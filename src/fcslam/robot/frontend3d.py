@@ -5,7 +5,6 @@ Packets are those of a robot with a 2D laser, with motions in six degrees of fre
 """
 
 import math
-from collections import deque
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
@@ -36,7 +35,8 @@ from fcslam.records import (
     SensorRecord,
     frozen,
 )
-from fcslam.robot.backend import SessionConfig
+from fcslam.robot.backend import SessionConfig, Task
+from fcslam.robot.packet_queue import PacketQueue
 from fcslam.robot.track import ScanBelief, ScanTrack
 from fcslam.sources.clouds_in_space import BAND_LASER
 from fcslam.sources.gate import MAX_STEP_BACK_S
@@ -70,18 +70,16 @@ class RobotFrontend3d:
         self.robot = robot
         self.tracks: list[ScanTrack] = []
         """Poses of the turns, by session."""
-        self.jumps, self.backlog, self.failure = 0, 0, None
-        """As in ``RobotFrontend``: turns are registered whatever the odometry says, and there is no back end."""
+        self.jumps = 0
+        """As in ``RobotFrontend``: turns are registered whatever the odometry says."""
         self.newest: NewestTurn | None = None
         """The newest turn; None before the first."""
         self.mapped: tuple[MappedTurn, FloatArray] | None = None
         """The newest keyframe, and ``T_odom_ground`` there, shape (7,); None before the first."""
-        self.awaited = None
-        """As in ``RobotFrontend``."""
         self.lacks_odometry, self.odometry_fault = True, None
         self._describes = Channel.LIDAR in config.channels
-        self._packets: deque[Packet] = deque()
-        self._time = self._stamp = self._certain_s = -np.inf
+        self.packets = PacketQueue(robot, _passed_on)
+        self._stamp = self._certain_s = -np.inf
         self._begin(ScanTrack(floor, is_new_floor=True, group=SE3))
 
     @property
@@ -126,11 +124,9 @@ class RobotFrontend3d:
             self._track(record)
         return self.ready()
 
-    def ready(self, wait: bool = False) -> list[Packet]:  # noqa: ARG002  nothing runs beside the front end
+    def ready(self, wait: bool = False) -> list[Packet]:
         """The next packets."""
-        packets = list(self._packets)
-        self._packets.clear()
-        return packets
+        return self.packets.ready(wait)
 
     def begin_session(self) -> None:
         """End the present session and begin another: the next turn is of another place."""
@@ -152,7 +148,7 @@ class RobotFrontend3d:
     def _begin(self, track: ScanTrack) -> None:
         self.tracks.append(track)
         self._tracker, self._keyframes, self._local_maps = Tracker3d(), Keyframes(), SurfaceMaps()
-        self._sequence, self._poor = 0, 0
+        self._poor = 0
         self._stamp = self._certain_s = -np.inf
 
     def _track(self, scan: CloudScan) -> None:
@@ -166,7 +162,7 @@ class RobotFrontend3d:
             tracked = self._tracker.track(scan)
         if not self._poor:
             self._certain_s = scan.stamp
-        self._time = max(self._time, scan.stamp)
+        self.packets.advance(scan.stamp)
         keyframe, motion = self._keyframes.add(tracked, self._tracker.sensors.force)
         newest = self._keyframes.newest
         assert newest is not None  # the first turn of a session is a keyframe
@@ -216,8 +212,14 @@ class RobotFrontend3d:
         rest = self._local_maps.finish()
         if rest is not None:
             self._send_map(rest)
+        self._send(Task.END_SESSION)
 
-    def _send(self, body: Body) -> None:
-        packet = Packet(self.robot, len(self.tracks) - 1, self._sequence, self._time, body)
-        self._packets.append(packet.on_floor(self.scan_poses.floor))
-        self._sequence += 1
+    def _send(self, body: Body | Task) -> None:
+        self.packets.submit(body, len(self.tracks) - 1, self.scan_poses)
+
+
+def _passed_on(body: Body | Task) -> Future[list[Body]]:
+    """What the queue of packets gets back at once: there is no back end."""
+    done: Future[list[Body]] = Future()
+    done.set_result([] if isinstance(body, Task) else [body])
+    return done

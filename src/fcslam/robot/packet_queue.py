@@ -1,19 +1,20 @@
 """The packets of one robot: what its back end makes of each input, numbered in the order of the inputs."""
 
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, replace
+from typing import Any
 
 from fcslam.errors import FeatureError
-from fcslam.robot.backend import BackendInput, NewKeyscan, Task, essential
-from fcslam.robot.backend_runner import Submit
+from fcslam.robot.backend import NewKeyscan, Task, essential
 from fcslam.robot.track import ScanTrack
 from fcslam.wire.messages import Body, Hello, Packet
 
 
 @dataclass(frozen=True, slots=True)
 class _Waiting:
-    input: BackendInput
+    input: object
     output: "Future[list[Body]]"
     epoch: int
     track: ScanTrack
@@ -24,7 +25,7 @@ class _Waiting:
 class PacketQueue:
     """Gives inputs to the back end and numbers the packets; each session numbers its own from 0."""
 
-    def __init__(self, robot: str, submit: Submit) -> None:
+    def __init__(self, robot: str, submit: "Callable[[Any], Future[list[Body]]]") -> None:
         self.failure: str | None = None
         """Why the back end ended early; from then on the robot sends neither closures nor places. None if it works."""
         self._robot, self._submit = robot, submit
@@ -47,7 +48,7 @@ class PacketQueue:
         """Stamp the packets of the following inputs with ``stamp``, unless an earlier one was larger."""
         self._time = max(self._time, stamp)
 
-    def submit(self, input: BackendInput, epoch: int, track: ScanTrack) -> "Future[list[Body]]":
+    def submit(self, input: object, epoch: int, track: ScanTrack) -> "Future[list[Body]]":
         """Give the back end its next input, of session ``epoch`` with the poses ``track``."""
         try:
             output = self._submit(input)
