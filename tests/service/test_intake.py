@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.replies import SessionCorrection
+from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import InputError, PacketConflictError, PacketError, UnavailableError
 from fcslam.geometry import se3
 from fcslam.mission.mission_store import MissionStore
@@ -49,10 +50,10 @@ def desk(tmp_path):
 def test_poses_in_space_are_stored_by_a_mission_in_space_alone(desk):
     motion = replace(CLOSURE, robot="a", T_i_j=se3.from_plane(CLOSURE.T_i_j), information=np.eye(6))
     in_space = encode(replace(PACKETS[0], sequence=1000, body=motion))
-    flat = Intake(desk.store, lambda: 0.0, lambda: 1e9, in_plane=True)
     with pytest.raises(PlaneError, match="a: sends poses in space, and this mission began in the plane"):
-        flat.take("a", "x", write_batch([*DATA, in_space]), -1)
+        desk.take(*DATA, in_space)
     assert desk.store.arrivals(0, 10) == []
+    small(desk, fleet=FleetConfig(dimensions=3))
     desk.take(*DATA, in_space)
     assert len(desk.store.arrivals(0, 1000)) == len(DATA) + 1
 
@@ -97,12 +98,16 @@ def test_every_epoch_in_a_batch_is_acknowledged(desk):
     assert desk.take() == [Acknowledgement("a", 4, 0)], "a robot that only asks hears of its newest session"
 
 
+def claiming(**claims):
+    return FleetConfig(claims=ClaimLimits(**claims))
+
+
 def small(desk, **limits):
     desk.intake = Intake(desk.store, lambda: desk.now, lambda: 1e9, **limits)
 
 
 def test_of_many_sessions_the_later_ones_wait(desk):
-    small(desk, limits=ClaimLimits(sessions_per_hour=3))
+    small(desk, fleet=claiming(sessions_per_hour=3))
     hellos = [
         encode(replace(PACKETS[0], epoch=epoch, body=replace(PACKETS[0].body, epoch=epoch))) for epoch in range(5)
     ]
@@ -120,7 +125,7 @@ def test_of_many_sessions_the_later_ones_wait(desk):
 
 
 def test_of_many_packets_the_later_ones_wait(desk):
-    small(desk, limits=ClaimLimits(packets_per_s=0.2))
+    small(desk, fleet=claiming(packets_per_s=0.2))
     most = MAXIMUM_BATCH_PACKETS * MAXIMUM_PACKET_BYTES // PACKET_BYTES
     for _ in range(most // len(DATA)):
         desk.take(*DATA)  # a packet that comes again counts again
@@ -138,7 +143,7 @@ def test_what_unpacks_to_much_counts_for_that_before_it_is_unpacked(desk):
     body = {"number": 0, "channel": 1, "count": 2048, "detector_version": "test-1"}
     packets = [pb.Packet(version=VERSION, robot="a", sequence=k, place=body).SerializeToString() for k in range(1000)]
     assert sum(map(len, packets)) < 50_000
-    small(desk, limits=ClaimLimits(packets_per_s=1.0))
+    small(desk, fleet=claiming(packets_per_s=1.0))
     with pytest.raises(PacketError):
         desk.take(*packets)
     with pytest.raises(UnavailableError, match="packets of"):

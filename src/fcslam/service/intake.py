@@ -6,11 +6,11 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
-from fcslam.cloud.claims import ClaimLimits
 from fcslam.cloud.edits import in_force, is_removed
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
 from fcslam.cloud.replies import replies
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
+from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import FcslamError, InputError, PacketError, UnavailableError
 from fcslam.mission.mission_file import as_stored
 from fcslam.mission.mission_store import MissionStore, StoredPacket
@@ -124,18 +124,18 @@ class Intake:
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
         announced: Callable[[], Mapping[Channel, DetectorFile]] = dict,
-        limits: ClaimLimits | None = None,
+        fleet: FleetConfig | None = None,
         agents: Agents | None = None,
         most_waiting: int = MOST_WAITING,
         most_refused_bytes: int = MOST_REFUSED_BYTES,
-        in_plane: bool = False,
     ) -> None:
-        """``announced``: detectors that robots are to use; ``limits``: what a robot may send; ``agents``: who speaks
-        for the robots, if other instances know that as well; ``in_plane``: no robot may send poses in space.
+        """``announced``: detectors that robots are to use; ``fleet``: the mission's settings, for what a robot may
+        send; ``agents``: who speaks for the robots, if other instances know that as well.
         """
-        self._in_plane = in_plane
+        fleet = fleet or FleetConfig()
+        self._in_plane = fleet.dimensions == 2
         self._most_waiting, self._most_refused_bytes = most_waiting, most_refused_bytes
-        self._limits = limits = limits or ClaimLimits()
+        self._limits = limits = fleet.claims
         burst = max(20.0 * limits.packets_per_s, MAXIMUM_BATCH_PACKETS * MAXIMUM_PACKET_BYTES / PACKET_BYTES)
         self._packet_rate = TokenBuckets(clock, limits.packets_per_s, burst)
         self._session_rate = TokenBuckets(clock, limits.sessions_per_hour / 3600.0, limits.sessions_per_hour)

@@ -205,15 +205,8 @@ class Missions:
         _check_file(folder)
         store = MissionStore(folder.store)
         try:
-            settings = store.configure(self._config).fleet
-            intake = Intake(
-                store,
-                self._clock,
-                self._wall_clock,
-                self.detectors.announced,
-                settings.claims,
-                in_plane=settings.dimensions == 2,
-            )
+            fleet = store.configure(self._config).fleet
+            intake = Intake(store, self._clock, self._wall_clock, self.detectors.announced, fleet)
         except BaseException:
             store.close()
             raise

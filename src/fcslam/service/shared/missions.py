@@ -251,16 +251,8 @@ class SharedMissions:
                 with translate_errors(folder.path):
                     folder.path.mkdir(parents=True, exist_ok=True)
                 store = MissionStore(MissionTables(self._server, known.number))
-                settings = store.configure(self._config).fleet
+                fleet = store.configure(self._config).fleet
                 agents = SharedAgents(self._server, known.number, time.monotonic)
-                intake = Intake(
-                    store,
-                    time.monotonic,
-                    time.time,
-                    self.detectors.announced,
-                    settings.claims,
-                    agents,
-                    in_plane=settings.dimensions == 2,
-                )
+                intake = Intake(store, time.monotonic, time.time, self.detectors.announced, fleet, agents)
                 self._opened[name] = SharedMission(known.number, folder, self._server, store, intake, self._instance)
             return self._opened[name]
