@@ -63,25 +63,18 @@ def n_point_alignment(points_a: ArrayLike, points_b: ArrayLike, weights: ArrayLi
     if a.shape != b.shape:
         raise ValueError(f"matched points have one shape (..., N, 2), not {a.shape} and {b.shape}")
     w = np.ones(a.shape[:-1]) if weights is None else np.asarray(weights, dtype=np.float64)
+    a, b = a[..., 0] + 1j * a[..., 1], b[..., 0] + 1j * b[..., 1]
     with np.errstate(invalid="ignore", divide="ignore"):
-        return _align(_complex(a), _complex(b), w)
-
-
-def _align(a: Array, b: Array, w: Array) -> Array:
-    total = w.sum(axis=-1, keepdims=True)
-    mean_a, mean_b = (w * a).sum(axis=-1, keepdims=True) / total, (w * b).sum(axis=-1, keepdims=True) / total
-    from_a, from_b = a - mean_a, b - mean_b
-    turn = (w * from_a * np.conj(from_b)).sum(axis=-1)
+        total = w.sum(axis=-1, keepdims=True)
+        mean_a, mean_b = (w * a).sum(axis=-1, keepdims=True) / total, (w * b).sum(axis=-1, keepdims=True) / total
+        from_a, from_b = a - mean_a, b - mean_b
+        turn = (w * from_a * np.conj(from_b)).sum(axis=-1)
     spread, size = ((w * (np.abs(p) ** 2 + np.abs(q) ** 2)).sum(axis=-1) for p, q in ((from_a, from_b), (a, b)))
     theta = np.angle(turn)
     shift = mean_a[..., 0] - np.exp(1j * theta) * mean_b[..., 0]
     pose = np.stack((shift.real, shift.imag, theta), axis=-1)
     is_determined = np.abs(turn) > np.maximum(_DEGENERATE * spread, _ROUNDING * size)
     return np.where(is_determined[..., None], pose, np.nan)
-
-
-def _complex(points: Array) -> Array:
-    return points[..., 0] + 1j * points[..., 1]
 
 
 def _coincide(points: Array) -> bool:

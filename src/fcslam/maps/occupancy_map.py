@@ -106,13 +106,11 @@ def server_files(stem: str, occupancy: OccupancyMap) -> dict[str, bytes]:
     return {image: pgm_bytes(occupancy), f"{stem}.yaml": map_yaml(occupancy, image).encode()}
 
 
-MapImage = tuple[NDArray[np.uint8], NDArray[np.uint8], float, tuple[float, float]]
-"""The image of a map, shape (H, W), row 0 at the lowest y, a view of the file's content; ``Occupancy`` by pixel, shape
-(256,); the side of a cell; and the lower left corner of cell (0, 0)."""
+def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
+    """Read back what ``pgm_bytes`` and ``map_yaml`` wrote; also what map_server saves in the mode trinary.
 
-
-def parse_image(name: str, pgm: bytes, description: str) -> MapImage:
-    """Like ``parse_map``, without a copy of the image, which may be large."""
+    Messages call the map ``name``; the image that the description names is not opened.
+    """
     try:
         width, height, begin = _size(pgm)
         if len(pgm) - begin != width * height:
@@ -121,20 +119,11 @@ def parse_image(name: str, pgm: bytes, description: str) -> MapImage:
     except ValueError as error:
         raise InputError(f"{name} is broken: {one_line(str(error))}") from error
     occupancy = (255 - np.arange(256)) / 255.0
-    known = np.full(256, Occupancy.UNKNOWN, np.uint8)
-    known[occupancy < free_threshold] = Occupancy.FREE
-    known[occupancy > occupied_threshold] = Occupancy.OCCUPIED
+    meaning = np.full(256, Occupancy.UNKNOWN, np.uint8)
+    meaning[occupancy < free_threshold] = Occupancy.FREE
+    meaning[occupancy > occupied_threshold] = Occupancy.OCCUPIED
     pixels = np.frombuffer(pgm, np.uint8, offset=begin).reshape(height, width)
-    return frozen(pixels[::-1], np.uint8), frozen(known, np.uint8), resolution_m, origin_xy
-
-
-def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
-    """Read back what ``pgm_bytes`` and ``map_yaml`` wrote; also what map_server saves in the mode trinary.
-
-    Messages call the map ``name``; the image that the description names is not opened.
-    """
-    pixels, meaning, resolution_m, origin_xy = parse_image(name, pgm, description)
-    return OccupancyMap(frozen(_looked_up(meaning, pixels), np.uint8), resolution_m, origin_xy)
+    return OccupancyMap(frozen(_looked_up(meaning, pixels[::-1]), np.uint8), resolution_m, origin_xy)
 
 
 def area_of(name: str, header: bytes, description: str) -> tuple[float, tuple[float, float, float, float]]:

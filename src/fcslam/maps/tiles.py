@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.maps.occupancy_map import PIXELS, Occupancy, parse_image, pixels_of
+from fcslam.maps.occupancy_map import PIXELS, Occupancy, parse_map, pixels_of
 from fcslam.runs.folder import identity
 from fcslam.untrusted import read_bytes, read_text
 
@@ -74,11 +74,11 @@ def _pyramid(
     the resolution of the first level, and the lower left corner, shape (2,), in metres.
     """
     pgm, description = read_bytes(folder / f"{stem}.pgm", folder), read_text(folder / f"{stem}.yaml", folder)
-    pixels, meaning, resolution_m, origin_xy = parse_image(stem, pgm, description)
-    levels: list[NDArray[np.uint8]] = [cv2.LUT(pixels, pixels_of(meaning))]
-    for _ in range(math.floor(math.log2(max(WORLD_M / TILE_PX / resolution_m, 1.0)))):
+    occupancy = parse_map(stem, pgm, description)
+    levels = [pixels_of(occupancy.cells)]
+    for _ in range(math.floor(math.log2(max(WORLD_M / TILE_PX / occupancy.resolution_m, 1.0)))):
         levels.append(_halved(levels[-1]))
-    return levels, resolution_m, np.array(origin_xy)
+    return levels, occupancy.resolution_m, np.array(occupancy.origin_xy)
 
 
 def _halved(finer: NDArray[np.uint8]) -> NDArray[np.uint8]:
