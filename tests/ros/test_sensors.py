@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from fcslam.errors import SourceError
-from fcslam.records import CameraImage, GnssFix
+from fcslam.records import CameraImage, GnssFix, LaserScan
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.ros.live_plan import PATIENCE_S, SCANS_FOR_RIG
 from fcslam.ros.sensors import ODOMETRY_PATIENCE_S, STEPS_BACK_FOR_RESTART, LiveSensors
 from fcslam.ros.topics import SensorTopics
-from fcslam.sources import BagOptions
-from fcslam.sources.bags.codec import CAMERA_INFO, FIX, IMAGE, IMU, MULTI_ECHO_SCAN, POINT_CLOUD
+from fcslam.sources import BagOptions, open_source
+from fcslam.sources.bags.codec import CAMERA_INFO, FIX, IMAGE, IMU, POINT_CLOUD, TRANSFORMS
+from fcslam.sources.bags.records import RecordFile
 from fcslam.sources.faults import Fault
+from fcslam.sources.point_clouds import FEWEST_FLOORS
 from fcslam.wire.limits import MAXIMUM_BEAMS
 from tests.ros.ros_messages import (
     CODEC,
@@ -25,12 +27,14 @@ from tests.ros.ros_messages import (
     header,
     image,
     imu,
-    multi_echo,
     odometry,
     scan,
     transform,
 )
+from tests.sources.bag_messages import quaternion, save
 from tests.sources.clouds import PERIOD_S, VELODYNE, at_rest, cloud, depth_image, plan_ranges, rotation, spinning
+from tests.sources.test_bag_clouds import YAW, leaning_bag
+from tests.sources.test_drivers import in_tf, late
 
 pytestmark = pytest.mark.slow
 
@@ -184,14 +188,6 @@ def test_a_missing_mounting_says_who_could_publish_it_and_the_robot_waits():
     assert robot.said == [line]
 
 
-def test_of_several_echoes_the_first_counts():
-    robot = Robot(kinds={**KINDS, "/scan": MULTI_ECHO_SCAN}, laser_poses=((0.1, 0.0, 0.0),))
-    for stamp in np.arange(1.0, 9.0):
-        robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0))).hears("/scan", multi_echo(stamp, [5.0] * 179 + [0.0]))
-    assert robot.stamps == list(np.arange(1.0, 9.0))
-    np.testing.assert_array_equal(robot.records[0].ranges_m, [5.0] * 179 + [np.nan])
-
-
 def test_odometry_without_a_frame_is_odometry(robot):
     for stamp in np.arange(1.0, 9.0):
         robot.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0), frame="")).hears("/scan", scan(stamp, RANGES))
@@ -315,7 +311,7 @@ def test_clouds_that_are_read_whole_come_with_the_readings_until_their_end(wheel
                     robot.hears("/odom", odometry(later, (later, 0.0, 0.0)))
 
     drives(9.0 + 0.1 * np.arange(12))
-    assert robot.stamps == pytest.approx(9.1 + 0.1 * np.arange(11))  # the first shows how long a turn takes
+    assert robot.stamps == pytest.approx(9.0 + 0.1 * np.arange(12))
     record = robot.records[-1]
     heights = record.points_m[:, 2]
     assert np.median(heights[heights < 0.2]) == pytest.approx(0.0, abs=0.01)
@@ -334,7 +330,7 @@ def test_a_lidar_with_one_ring_is_refused_in_3d():
     robot = Robot(kinds={**KINDS, "/points": POINT_CLOUD}, scans=("/points",), in_3d=True)
     robot.hears("/tf_static", transform(0.0, "base_link", "lidar", LASER_POSE, height_m=0.4))
     measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rings=1)
-    for stamp in 0.1 * np.arange(1, 2 + SCANS_FOR_RIG):
+    for stamp in 0.1 * np.arange(1, 1 + FEWEST_FLOORS):
         robot.hears("/points", CODEC.encode(cloud(stamp, measured, VELODYNE), POINT_CLOUD))
     with pytest.raises(SourceError, match="/points has one ring, so it is a 2D laser; map it without --3d"):
         robot.hears("/odom", odometry(1.0, (0.0, 0.0, 0.0)))
@@ -395,7 +391,7 @@ def test_clocks_that_differ_are_those_by_which_messages_arrive(robot, ahead_s, i
     assert [record.T_odom_base[0] for record in scans[:3]] == pytest.approx([1.0, 1.5, 2.0], abs=0.03)
     assert [record.stamp for record in fixes] == pytest.approx(WALL_S + np.arange(1.0, 15.0), abs=0.03)
     assert [line.partition(" is ")[0] for line in robot.said] == [
-        f"the clock of {'the odometry in tf' if in_tf else '/odom'}", "the clock of /fix",
+        f"the clock of {'tf from odom to base_link' if in_tf else '/odom'}", "the clock of /fix",
     ]  # fmt: skip
     assert all(f" {ahead_s:.2f}" in line.replace(f"{ahead_s + 0.01:.3f}", f"{ahead_s:.2f}") for line in robot.said)
 
@@ -436,33 +432,36 @@ def test_a_gyro_turns_a_robot_without_wheels():
     assert robot.hears("/scan", scan(10.0, RANGES)).stamps[-1] == 10.0  # a gyro that has stopped holds no scan
 
 
-@pytest.mark.parametrize("period_s", [0.1, 0.25, 1.0])
-def test_times_of_points_in_shares_of_a_turn_are_named(period_s):
-    robot = Robot(kinds={**KINDS, "/points": POINT_CLOUD}, scans=("/points",))
-    robot.hears("/tf_static", transform(0.0, "base_link", "lidar", LASER_POSE, height_m=0.4))
-    measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rotation(yaw=LASER_POSE[2]), rings=8)
-    shares = measured._replace(times=measured.times / PERIOD_S)
-    for stamp in 1.0 + period_s * np.arange(12):
-        robot.hears("/odom", odometry(stamp, (0.0, 0.0, 0.0)))
-        robot.hears("/points", CODEC.encode(cloud(stamp, shares, VELODYNE), POINT_CLOUD))
-    assert "times that are no seconds" in " ".join(robot.said)
-    assert robot.records
-    assert all(record.sweep is None for record in robot.records)
+def played(path, **options):
+    """A robot that hears the messages of a bag as they were recorded."""
+    stored = list(RecordFile(path, ros1=False).messages())
+    kinds = {each.topic: each.kind for each in stored} | {"/tf": TRANSFORMS}
+    scans = tuple(sorted({"/scan", "/points"} & kinds.keys()))
+    robot = Robot("/odom" if "/odom" in kinds else None, kinds, scans=scans, **options)
+    for each in stored:
+        robot.now_s = each.time_ns / 1e9
+        robot.hears(each.topic, each.payload, robot.now_s)
+    robot.records += robot.sensors.finish()
+    return robot
 
 
-def test_a_camera_that_looks_up_by_tf_is_turned_and_named():
-    kinds = {**KINDS, "/depth/image": IMAGE, "/depth/camera_info": CAMERA_INFO}
-    robot = Robot(kinds=kinds, scans=("/depth/image",))
-    frame, info = depth_image(1.0, "32FC1")
-    robot.hears("/depth/camera_info", CODEC.encode(info, CAMERA_INFO))
-    robot.hears("/tf_static", transform(0.0, "base_link", "camera_link", (0.0, 0.0, 0.0), height_m=0.5))
-    for stamp in 1.2 + 0.1 * np.arange(SCANS_FOR_RIG + 3):
-        frame.header = header(stamp, "camera_link")
-        robot.hears("/odom", odometry(stamp, (0.0, 0.0, 0.0))).hears("/depth/image", CODEC.encode(frame, IMAGE))
-    assert "so 'camera_link' is not its optical frame; corrected" in " ".join(robot.said)
-    record = robot.records[0]
-    errors = np.abs(record.ranges_m - plan_ranges(0.0, 0.0, record.laser.angles_rad()))
-    assert np.nanmedian(errors) < 0.005
+@pytest.mark.parametrize(
+    ("make", "words"),
+    {
+        "odometry in tf": (lambda path: save(path, in_tf()), ""),
+        "a clock of its own": (lambda path: save(path, late(17.0)), "the clock of /odom is 17.0"),
+        "points that lean": (lambda path: leaning_bag(path, quaternion(YAW), roll=-0.5), "the floor in /points leans"),
+    }.values(),
+)
+def test_a_live_robot_is_read_as_its_bag(make, words, tmp_path):
+    path = make(tmp_path / "run.mcap")
+    source, robot = open_source(path), played(path)
+    assert (words in " ".join(robot.said), words in " ".join(source.survey().notes)) == (True, True)
+    of_bag, live = ([r for r in records if isinstance(r, LaserScan)] for records in (source.records(), robot.records))
+    assert [scan.stamp for scan in live] == pytest.approx([scan.stamp for scan in of_bag], abs=2e-3)
+    for one, other in zip(live, of_bag, strict=True):
+        assert np.nanmedian(np.abs(one.ranges_m - other.ranges_m)) < 1e-3
+        assert one.T_odom_base == pytest.approx(other.T_odom_base, abs=2e-3)
 
 
 def turned(message, **numbers):

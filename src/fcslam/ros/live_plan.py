@@ -1,167 +1,213 @@
-"""Decides from the first messages of a live robot how it is read: its lasers, its odometry and its camera."""
+"""Plans from the first messages of a live robot how it is read, as from those of a bag."""
 
-from collections import deque
-from collections.abc import Callable, Iterable
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
 from typing import Final, NamedTuple
 
 from fcslam.ros.topics import SensorTopics
-from fcslam.sources.bags.camera import Calibration
+from fcslam.sources.bags.census import BagMessage, Messages, TopicCensus
+from fcslam.sources.bags.codec import CLOUDS, FIX, IMAGE
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.messages import OdometryReading, ScanMessage, StampedTransform
+from fcslam.sources.bags.messages import ScanMessage, header_of
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
-from fcslam.sources.bags.rig import (
-    RecordedLaser,
-    Rig,
-    mounted_camera,
-    mountings_of,
-    recorded_laser,
-    rig_of,
-    tilt_note,
-)
-from fcslam.sources.bags.transforms import Link, NoTransformError, TransformTree
-from fcslam.sources.path_summary import without_odometry
+from fcslam.sources.bags.plan import USUAL_ODOM, BagPlan, plan_of
+from fcslam.sources.bags.records import StoredMessage
+from fcslam.sources.bags.rig import RecordedLaser, Rig
+from fcslam.sources.bags.robots import BagRobot
+from fcslam.sources.bags.topics import Topics, info_beside
+from fcslam.sources.bags.transforms import NoTransformError
+from fcslam.sources.clouds_in_space import CloudReader
+from fcslam.sources.point_clouds import FARTHEST_M, FEWEST_FLOORS
 
-USUAL_ODOM: Final = "odom"
-"""Frame of an odometry that names none."""
 SCANS_FOR_RIG: Final = 5
-"""Number of first scans of each laser that decide which beams it has."""
+"""Number of first scans of each laser that decide which beams it has; clouds show the floor, too."""
 PATIENCE_S: Final = 5.0
 """Time after which a live robot says that the odometry, a laser or a mounting is missing, and waits no longer for a
 calibration."""
-_SCANS_KEPT: Final = 100
-"""Most first scans of a laser that decide."""
+_LONGEST_WAIT: Final = 10_000
+"""Most first messages that wait for the plan."""
+_MOST_LARGE: Final = 100
+"""Most of them that are clouds or depth images."""
 
 Notify = Callable[[str], None]
 """Takes one line for the user; what repeats a line is not said again."""
 
 
+class FirstMessages(Messages):
+    """The first messages of a live robot, by which it is planned; later ones are only decoded."""
+
+    path = Path()
+
+    def __init__(self, topics: SensorTopics, namespace: str) -> None:
+        """``namespace`` is "" or begins with a slash."""
+        self.namespace = namespace.strip("/")
+        self.by_name = {name: Topic(name, kind, 1) for name, kind in topics.kinds.items()}
+        self.is_planned = False
+        self._census = {topic: TopicCensus(number) for number, topic in enumerate(self.by_name.values())}
+        self._kept: deque[BagMessage] = deque(maxlen=_LONGEST_WAIT)
+        self.counts: Counter[Topic] = Counter()
+        """Of those that were kept."""
+        self._frames: dict[Topic, str] = {}
+        """Of the first scan of each topic."""
+
+    @property
+    def census(self) -> Mapping[Topic, TopicCensus]:
+        """As in ``Messages``."""
+        return self._census
+
+    def decoded(self, name: str, payload: bytes, received_ns: int) -> BagMessage:
+        """The next message of the topic with this name, as in a bag."""
+        topic = self.by_name[name]
+        its = self._census[topic]
+        if self.is_planned:
+            its.forget()
+        its.add(received_ns)
+        stored = StoredMessage(name, topic.type, received_ns, payload, (-1, 0, 0))
+        return BagMessage(topic, its.count, received_ns, received_ns, its.decoded(stored, ros1=False))
+
+    def clocked(self, message: BagMessage) -> BagMessage:
+        """The message by the clock of its topic, as it is known now."""
+        return message.by_clock(self._census[message.topic].clock.lag_ns)
+
+    def frames(self, scan: BagMessage) -> tuple[str, str]:
+        """The frame of the first scan of a topic, and of this one."""
+        content = scan.content
+        frame = content.frame if isinstance(content, ScanMessage) else header_of(content.header, 0)[1]
+        return self._frames.setdefault(scan.topic, frame), frame
+
+    def keep(self, message: BagMessage) -> None:
+        """Keep one of the first messages for the plan."""
+        self._kept.append(message)
+        self.counts[message.topic] += 1
+        large = [at for at, each in enumerate(self._kept) if each.topic.type in (*CLOUDS, IMAGE)]
+        if len(large) > _MOST_LARGE:
+            del self._kept[large[0]]
+
+    def read(self, topics: Collection[Topic]) -> Iterator[BagMessage]:
+        """As in ``Messages``."""
+        return (self.clocked(each) for each in self._kept if each.topic in topics)
+
+    def released(self) -> Iterator[BagMessage]:
+        """All that were kept, which are not kept any more."""
+        self.is_planned = True
+        while self._kept:
+            yield self.clocked(self._kept.popleft())
+
+    @property
+    def state(self) -> tuple[object, ...]:
+        """What decides whether there is a plan; another one may come with another state."""
+        return tuple(
+            (
+                min(self.counts[topic], FEWEST_FLOORS),
+                its.count > its.clock.unstamped,
+                sum(map(len, its.links.values())),
+            )
+            for topic, its in self._census.items()
+        )
+
+
 class LivePlan(NamedTuple):
     """How a live robot is read."""
 
+    sensors: BagPlan
     rig: Rig
-    lasers: tuple[RecordedLaser, ...]
-    edge: Link | None
-    """Frames of the odometry in tf; None: it is on a topic, or there is none."""
-
-    def is_odometry(self, item: object) -> bool:
-        """Whether something that was read is a reading of the odometry."""
-        return isinstance(item, OdometryReading) and self.edge in (None, (item.odom_frame, item.base_frame))
+    clouds: CloudReader | None
+    """Of a robot with a 3D LiDAR."""
 
 
 class LivePlanner:
-    """Collects what a plan needs, and says what is missing."""
+    """Plans as soon as enough is heard, and says what is missing."""
 
     def __init__(self, topics: SensorTopics, namespace: str, options: BagOptions, notify: Notify) -> None:
         """``namespace`` is "" or begins with a slash."""
-        self.tree = TransformTree()
-        self.calibrations: dict[str, Calibration] = {}
-        """By the topic of camera_info."""
-        self.awaited: dict[str, str] = {}
-        """Topics whose messages cannot be scans before tf and a calibration are known, and a line that says it."""
+        self.messages = FirstMessages(topics, namespace)
         self.odom_frame, self.base_frame = USUAL_ODOM, ""
-        """Frames of the odometry, once it is there; a driver may leave them out."""
+        """Frames of the odometry, once there is a plan; a driver may leave them out."""
         self.is_without_odometry = options.odom_topic == NO_ODOMETRY
-        self._topics, self._options, self._notify = topics, options, notify
-        self._prefix = namespace.strip("/")
-        self._first: list[deque[ScanMessage]] = [deque(maxlen=_SCANS_KEPT) for _ in topics.scans]
-        self._has_odometry = False
-        self._edge: Link | None = None
+        self._options, self._notify = options, notify
+        scans, transforms, odometry, camera, info = (
+            tuple(self.messages.by_name[name] for name in names if name)
+            for names in (topics.scans, topics.transforms, (topics.odometry,), (topics.camera,), (topics.camera_info,))
+        )
+        self._odometry = next(iter(odometry), None)
+        camera_topic = next(iter(camera), None)
+        self._topics = Topics(scans, odometry or transforms, transforms, camera_topic, next(iter(info), None), ())
+        own = tuple(topic for topic in self.messages.topics if topic.type != FIX)  # these are read on their own
+        self._robot = BagRobot(self.messages, "", own, transforms, {}, {})
         self._began: float | None = None
-
-    @property
-    def known_base_frame(self) -> str:
-        """The frame of the odometry, or else a usual one that tf has."""
-        return self.base_frame or self.tree.usual_base
-
-    def add_scan(self, scan: ScanMessage, is_stamped: bool = True) -> None:
-        """Take one of the first scans of a laser; those without a stamp are not enough, as others show the clock."""
-        if is_stamped or len(self._first[scan.laser]) < SCANS_FOR_RIG - 1:
-            self._first[scan.laser].append(scan)
-
-    def add_reading(self, reading: OdometryReading) -> None:
-        """Take a message of odometry."""
-        self.odom_frame = reading.odom_frame or USUAL_ODOM
-        self.base_frame = self._options.base_frame or reading.base_frame
-        self._has_odometry = True
-
-    def add_transforms(self, transforms: Iterable[StampedTransform]) -> None:
-        """Take the transforms of a message of tf, but those of other robots on the same tf."""
-        for transform in transforms:
-            prefix = transform.child.rpartition("/")[0]
-            if not prefix or not self._prefix or prefix == self._prefix:
-                self.tree.add(transform.parent, transform.child, transform.T_parent_child)
+        self._tried: tuple[object, ...] = ()
 
     def plan(self, now_s: float) -> LivePlan | None:
         """The plan if enough is known; None to wait for more."""
         self._began = now_s if self._began is None else self._began
         is_late = now_s > self._began + PATIENCE_S
-        self._find_odometry(is_late)
+        state = is_late, *self.messages.state
+        if state == self._tried:
+            return None
+        self._tried = state
         if not self._is_heard(is_late):
             return None
-        self.base_frame = base_frame = self.known_base_frame
-        lasers = tuple(
-            recorded_laser(Topic(topic, self._topics.kinds[topic], len(scans)), scans)
-            for topic, scans in zip(self._topics.scans, self._first, strict=True)
-        )
         try:
-            mountings = mountings_of(lasers, self.tree, base_frame, self._options.laser_poses)
+            plan = plan_of(self._robot, self._options, self._topics)
+            rig, notes = plan.rig([self._farthest_m(laser) for laser in plan.lasers], self._options)
+            clouds = None
+            if plan.scans.is_whole(self._topics.scans[0]):
+                clouds, of_clouds = plan.scans.whole_reader(self._topics.scans[0])
+                notes += of_clouds
         except NoTransformError as error:
-            if not is_late:
-                return None
-            self._notify(missing_mounting(error))
+            if is_late:
+                self._notify(
+                    f"waits for tf: it has {error}; start robot_state_publisher or static_transform_publisher, or give "
+                    "--sensors laser-pose=X,Y,THETA (metres, radians)"
+                )
             return None
-        camera, note = None, ""
-        if self._topics.camera is not None:
-            camera, note = mounted_camera(self.calibrations.get(self._topics.camera_info or ""), self.tree, base_frame)
-            if camera is None and not is_late:
-                return None
-        if note:
-            self._notify(f"the camera of {self._topics.camera} {note}")
-        for topic, mounted in zip(self._topics.scans, mountings, strict=True):
-            if tilt := tilt_note(mounted):
-                self._notify(f"the laser of {topic} is {tilt}")
-        farthest_m = [max(scan.range_max_m for scan in scans) for scans in self._first]
-        for scans in self._first:
-            scans.clear()
-        return LivePlan(rig_of(lasers, farthest_m, mountings, camera), lasers, self._edge)
+        if self._topics.camera is not None and rig.camera is None and not is_late:
+            return None
+        for note in (*plan.notes, *plan.scans.notes, *notes):
+            self._notify(note)
+        if plan.odometry is None and not self.is_without_odometry:
+            self._notify(
+                "to use odometry, start the driver of the base before the robot, or name its topic by --sensors "
+                "odom-topic"
+            )
+        self.odom_frame, self.base_frame = plan.frames
+        self.is_without_odometry = plan.odometry is None
+        return LivePlan(plan, rig, clouds)
 
-    def _find_odometry(self, is_late: bool) -> None:
-        if self._topics.odometry is not None or self._edge is not None or not self._first[0]:
-            return
-        names = self._first[0][-1].frame, self._options.odom_frame, self._options.base_frame
-        if self.tree.robot(*names)[0] or is_late or self._options.laser_poses:
-            self._edge = self.tree.odometry_link(*names)
-        if self._edge is not None:
-            self.odom_frame, self.base_frame = self._edge
-            self._has_odometry = True
+    def _farthest_m(self, laser: RecordedLaser) -> float:
+        scans = (message.decoded for message in self.messages.read([laser.topic]))
+        return max((scan.range_max_m for scan in scans if isinstance(scan, ScanMessage)), default=FARTHEST_M)
 
     def _is_heard(self, is_late: bool) -> bool:
-        for topic, scans in zip(self._topics.scans, self._first, strict=True):
-            if not scans and is_late:
-                silent = f"waits for scans: none that can be read arrived on {topic} within {PATIENCE_S:.0f} s"
-                self._notify(self.awaited.get(topic, silent))
-        enough = all(len(scans) >= (1 if is_late else SCANS_FOR_RIG) for scans in self._first)
-        if is_late and not (self._has_odometry or self.is_without_odometry):
-            if self._topics.odometry is not None:
+        census, counts, enough = self.messages.census, self.messages.counts, True
+        for topic in self._topics.scans:
+            its, info = census[topic], self.messages.by_name.get(info_beside(topic.name))
+            is_stamped = its.count > its.clock.unstamped
+            needed = FEWEST_FLOORS if topic.type in CLOUDS else SCANS_FOR_RIG
+            enough &= counts[topic] >= (1 if is_late else needed) and (is_late or is_stamped)
+            if topic.type == IMAGE and info is not None and not counts[info]:
+                enough = False
+                if is_late:
+                    self._notify(f"waits for the calibration of {topic.name}: {info.name} is silent; publish it")
+            elif not counts[topic] and is_late:
                 self._notify(
-                    f"waits for odometry: {self._topics.odometry} is silent; the driver of the base publishes it; "
-                    "start it, or choose another topic by --sensors odom-topic=TOPIC; odom-topic=none maps without "
-                    "odometry"
+                    f"waits for scans: none that can be read arrived on {topic.name} within {PATIENCE_S:.0f} s"
                 )
-            elif enough:
-                self.is_without_odometry = True
-                first = self._first[0]
-                interval_s = (first[-1].stamp - first[0].stamp) / max(1, len(first) - 1)
-                self._notify(
-                    f"{without_odometry(interval_s)}. To use odometry, start the driver of the base before the robot, "
-                    "or name its topic by --sensors odom-topic"
-                )
-        return enough and (self._has_odometry or self.is_without_odometry)
+        if not enough or self.is_without_odometry:
+            return enough
+        if self._odometry is None:
+            return is_late or self._moves_in_tf
+        if not counts[self._odometry] and is_late:
+            self._notify(
+                f"waits for odometry: {self._odometry.name} is silent; the driver of the base publishes it; start it, "
+                "or choose another topic by --sensors odom-topic=TOPIC; odom-topic=none maps without odometry"
+            )
+        return counts[self._odometry] > 0
 
-
-def missing_mounting(error: NoTransformError) -> str:
-    """What a robot waits for if tf lacks the mounting of a laser."""
-    return (
-        f"waits for tf: it has {error}; start robot_state_publisher or "
-        "static_transform_publisher, or give --sensors laser-pose=X,Y,THETA (metres, radians)"
-    )
+    @property
+    def _moves_in_tf(self) -> bool:
+        first = next(self.messages.read([self._topics.scans[0]]))
+        tree = self.messages.tree(self._topics.transforms)
+        names = self.messages.frames(first)[0], self._options.odom_frame, self._options.base_frame
+        return bool(tree.robot(*names)[0] or (self._options.laser_poses and tree.odometry_link(*names)))

@@ -8,7 +8,7 @@ import numpy as np
 from fcslam.errors import SourceError
 from fcslam.geometry.beams import is_same_laser
 from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odometry
-from fcslam.sources.bags.census import DecodedBag
+from fcslam.sources.bags.census import Messages
 from fcslam.sources.bags.codec import SCANS
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.transforms import Link
@@ -136,7 +136,7 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
     )
 
 
-def _bag_contents(bag: DecodedBag) -> BagContents:
+def _bag_contents(bag: Messages) -> BagContents:
     topics, edges, frames = [], dict[Link, None](), {}
     for topic, its in bag.census.items():
         first_ns, last_ns = its.span_ns

@@ -44,7 +44,7 @@ LEANING_RAD: Final = radians(10.0)
 """A mounting from which the floor leans by more in most clouds is wrong."""
 LARGEST_LEANING_RAD: Final = radians(40.0)
 """Beyond, walls and the floor may be confused."""
-_FEWEST_FLOORS, _SAME_FLOOR_RAD = 8, radians(4.0)
+FEWEST_FLOORS, _SAME_FLOOR_RAD = 8, radians(4.0)
 """Clouds that show it at least, and the largest deviation of their floors from the middle one."""
 FLOOR_REACH_M: Final = 12.0
 """The floor is fitted to points up to this distance."""
@@ -201,12 +201,12 @@ def leaning(clouds: Iterable[PointCloud], mounting: CloudMounting) -> FloatArray
     in_base = [cloud.points @ mounting.rotation.T + mounting.position_m for cloud in clouds]
     floors = [floor_in(points, mounting, LARGEST_LEANING_RAD) for points in in_base]
     normals = np.array([floor[0] for floor in floors if floor is not None]).reshape(-1, 3)
-    if len(normals) < max(_FEWEST_FLOORS, len(in_base) // 2):
+    if len(normals) < max(FEWEST_FLOORS, len(in_base) // 2):
         return None
     middle = np.median(normals, axis=0)
     middle /= np.linalg.norm(middle)
     is_same = normals @ middle > cos(_SAME_FLOOR_RAD)
-    if middle[2] > cos(LEANING_RAD) or np.count_nonzero(is_same) < max(_FEWEST_FLOORS, len(in_base) // 2):
+    if middle[2] > cos(LEANING_RAD) or np.count_nonzero(is_same) < max(FEWEST_FLOORS, len(in_base) // 2):
         return None
     return _levelling(middle, 0.0)
 

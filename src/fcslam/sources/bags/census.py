@@ -1,4 +1,4 @@
-"""The messages of a bag, from one pass over its files: what they name, and where each lies.
+"""The messages by which a robot is planned. Those of a bag come from one pass over its files.
 
 Laser scans, odometry and transforms are decoded in this pass and kept in a temporary file. Point clouds and images are
 too large for that; they are decoded whenever they are read.
@@ -6,15 +6,17 @@ too large for that; they are decoded whenever they are read.
 
 import json
 import os
+from abc import ABC, abstractmethod
 from array import array
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 from weakref import finalize
 
 import numpy as np
@@ -31,9 +33,8 @@ from fcslam.sources.bags.codec import (
     IMU,
     LASER_SCANS,
     ODOMETRY,
-    OLD_TRANSFORMS,
     SCANS,
-    TRANSFORMS,
+    TRANSFORM_KINDS,
     MessageCodec,
 )
 from fcslam.sources.bags.container import BagPart, Topic, check_order, open_parts
@@ -55,12 +56,14 @@ from fcslam.untrusted import ZSTD, LimitError, unpack
 _LATEST_NS: Final = int(np.iinfo(np.int64).max)
 """Of a damaged file, some times are larger."""
 _ROWS_AT_ONCE: Final = 256
-_KEPT: Final = (*LASER_SCANS, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
-_COUNTED: Final = (*SCANS, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
+_KEPT: Final = (*LASER_SCANS, ODOMETRY, *TRANSFORM_KINDS)
+_COUNTED: Final = (*SCANS, ODOMETRY, *TRANSFORM_KINDS)
 _CLOCKED: Final = (FIX, IMU)
 """Types of which only the stamps of the first messages are looked at."""
 _READ: Final = (*_COUNTED, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, FIX, IMU)
 
+
+Found = TypeVar("Found")
 
 Content = ScanMessage | OdometryReading | list[StampedTransform] | ValueError
 """A decoded message, or why it is invalid."""
@@ -91,29 +94,34 @@ class TopicCensus:
         first_ns, last_ns = self.span_ns if self.count else (time_ns, time_ns)
         self.count, self.span_ns = self.count + 1, (min(first_ns, time_ns), max(last_ns, time_ns))
 
-    def converted(self, message: StoredMessage, content: Any) -> Content | None:
-        """Convert an object of rosbags; None if it is not kept. Raises ValueError if it is invalid."""
-        now_ns = message.time_ns
-        if message.kind in (*SCANS, ODOMETRY, *_CLOCKED):
-            self.clock.note(content.header, now_ns)
-        if message.kind in _CLOCKED:
-            return None
-        if message.kind in SCANS:
-            self.frames[header_of(content.header, now_ns)[1]] += 1
-            return scan_of(content, now_ns) if message.kind in LASER_SCANS else None
+    def forget(self) -> None:
+        """Forget what the messages name: of a stream without end, it may be ever more."""
+        for names in (self.frames, self.links, self.odom_frames):
+            names.clear()
+
+    def decoded(self, message: StoredMessage, ros1: bool) -> Any:
+        """A message as in ``BagMessage``, after what it names is noted."""
+        try:
+            content = _decode(message.payload, message.kind, ros1)
+            stamped = content.transforms if message.kind in TRANSFORM_KINDS else (content,)
+            for each in stamped:
+                self.clock.note(each.header, message.time_ns)
+            if message.kind in SCANS:
+                self.frames[header_of(content.header, message.time_ns)[1]] += 1
+            found = _converted(message.kind, content, message.time_ns)
+        except ValueError as error:
+            if not self.broken:
+                self.first_broken, self.error = self.count, str(error)
+            self.broken += 1
+            return error
         if message.kind == ODOMETRY:
-            reading = odometry_of(content, now_ns)
-            self.frames[reading.base_frame] += 1
-            self.odom_frames.add(reading.odom_frame)
-            return reading
-        transforms = list(transforms_of(content, now_ns))
-        for entry in content.transforms:
-            self.clock.note(entry.header, now_ns)
-        for _, parent, child, transform in transforms:
+            self.frames[found.base_frame] += 1
+            self.odom_frames.add(found.odom_frame)
+        for _, parent, child, transform in found if message.kind in TRANSFORM_KINDS else ():
             seen = self.links.setdefault((parent, child), [transform])
             if difference(seen[0], transform) >= len(seen):
                 seen.append(transform)
-        return transforms
+        return found
 
 
 class BagMessage(NamedTuple):
@@ -135,9 +143,56 @@ class BagMessage(NamedTuple):
             raise self.decoded
         return self.decoded
 
+    def by_clock(self, lag_ns: int) -> "BagMessage":
+        """The same, read by a clock of the topic that is so far behind that of recording, if it has no stamp."""
+        is_converted = self.topic.type in _KEPT
+        decoded = restamped(self.decoded, self.bag_time_ns, lag_ns) if is_converted else self.decoded
+        return self._replace(unstamped_ns=self.bag_time_ns - lag_ns, decoded=decoded)
+
+
+class Messages(ABC):
+    """Messages by which a robot is planned: those of a bag, or the first ones of a live robot."""
+
+    path: Path
+    namespace = ""
+    """Of the robot, if the messages of tf may be of others, too."""
+
+    @property
+    def label(self) -> str:
+        """What lines about them begin with."""
+        return ""
+
+    @property
+    @abstractmethod
+    def census(self) -> Mapping[Topic, TopicCensus]:
+        """What the messages of each topic name; those that are invalid are left out."""
+
+    @abstractmethod
+    def read(self, topics: Collection[Topic]) -> Iterator[BagMessage]:
+        """The messages of ``topics`` in the order of recording."""
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """All topics, sorted by name; a topic with two types is listed twice."""
+        return tuple(self.census)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is wrong with their files, as sentences."""
+        return ()
+
+    def tree(self, topics: Iterable[Topic]) -> TransformTree:
+        """The frames and transforms of the robot on these topics of tf."""
+        tree = TransformTree()
+        for (parent, child), transforms in chain.from_iterable(self.census[topic].links.items() for topic in topics):
+            space = child.rpartition("/")[0]
+            for transform in transforms if not space or self.namespace in ("", space) else ():
+                tree.add(parent, child, transform)
+        return tree
+
 
 @dataclass(frozen=True)
-class DecodedBag:
+class DecodedBag(Messages):
     """A bag: one file, or several that are parts of one recording, merged by the times of recording.
 
     Any thread, and any copy of the process, may read it.
@@ -149,13 +204,13 @@ class DecodedBag:
         return DecodedBag, (self.path,)  # a copy in another process decodes the bag again
 
     @property
-    def topics(self) -> tuple[Topic, ...]:
-        """All topics, sorted by name; a topic with two types is listed twice."""
-        return tuple(self.census)
+    def label(self) -> str:
+        """As in ``Messages``."""
+        return f"{self.path}: "
 
     @property
     def census(self) -> dict[Topic, TopicCensus]:
-        """What the messages of each topic name; those that are invalid are left out."""
+        """As in ``Messages``."""
         _, census, _, _ = self._index
         return census
 
@@ -165,17 +220,8 @@ class DecodedBag:
         parts, _, _, _ = self._index
         return tuple(part.note for part in parts if part.note)
 
-    def tree(self, topics: Iterable[Topic]) -> TransformTree:
-        """The frames and transforms on these topics of tf."""
-        tree = TransformTree()
-        for topic in topics:
-            for (parent, child), transforms in self.census[topic].links.items():
-                for transform in transforms:
-                    tree.add(parent, child, transform)
-        return tree
-
     def read(self, topics: Collection[Topic]) -> Iterator[BagMessage]:
-        """The messages of ``topics`` in the order of recording."""
+        """As in ``Messages``."""
         parts, census, rows, tape = self._index
         by_number = {census[topic].number: topic for topic in topics}
         lags_ns = {number: census[topic].clock.lag_ns for number, topic in by_number.items()}
@@ -189,7 +235,7 @@ class DecodedBag:
                     counts[topic] += 1
                     decoded: Any
                     if topic.type in _KEPT:
-                        decoded = restamped(_unpacked(os.pread(tape, size, offset)), time_ns, lags_ns[number])
+                        decoded = _unpacked(os.pread(tape, size, offset))
                     else:
                         with parts[at].translated():
                             if at not in payloads:
@@ -199,7 +245,7 @@ class DecodedBag:
                             decoded = _decode(payload, topic.type, parts[at].file.ros1)
                         except ValueError as error:
                             decoded = error
-                    yield BagMessage(topic, counts[topic], time_ns, time_ns - lags_ns[number], decoded)
+                    yield BagMessage(topic, counts[topic], time_ns, time_ns, decoded).by_clock(lags_ns[number])
 
     @cached_property
     def _index(self) -> tuple[tuple[BagPart, ...], dict[Topic, TopicCensus], NDArray[np.int64], int]:
@@ -224,8 +270,8 @@ class DecodedBag:
                     if message.kind not in _READ:
                         continue
                     if message.kind in _COUNTED or (message.kind in _CLOCKED and topic.count <= FIRST_MESSAGES):
-                        content = _counted(topic, message, part.file.ros1)
-                        if content is not None and message.kind in _KEPT:
+                        content = topic.decoded(message, part.file.ros1)
+                        if message.kind in _KEPT:
                             size = tape.write(_packed(content))
                             place, written = (-1, written, size), written + size
                     rows.extend((time_ns, topic.number, at, *place))
@@ -251,6 +297,16 @@ class DecodedBag:
         return parts, census, table, tape.fileno()
 
 
+def valid(messages: Iterable[BagMessage], convert: Callable[[BagMessage], Found]) -> Iterator[Found]:
+    """The messages that can be converted."""
+    for message in messages:
+        try:
+            found = convert(message)
+        except ValueError:
+            continue
+        yield found
+
+
 def _messages(part: BagPart) -> Iterator[StoredMessage]:
     with part.translated():
         for message in part.file.messages():
@@ -261,14 +317,13 @@ def _messages(part: BagPart) -> Iterator[StoredMessage]:
             yield message
 
 
-def _counted(topic: TopicCensus, message: StoredMessage, ros1: bool) -> Content | None:
-    try:
-        return topic.converted(message, _decode(message.payload, message.kind, ros1))
-    except ValueError as error:
-        if not topic.broken:
-            topic.first_broken, topic.error = topic.count, str(error)
-        topic.broken += 1
-        return error
+def _converted(kind: str, content: Any, now_ns: int) -> Any:
+    """The content of a message of a type that is kept; of another, the object of rosbags."""
+    if kind in LASER_SCANS:
+        return scan_of(content, now_ns)
+    if kind == ODOMETRY:
+        return odometry_of(content, now_ns)
+    return list(transforms_of(content, now_ns)) if kind in TRANSFORM_KINDS else content
 
 
 def _decode(payload: bytes, kind: str, ros1: bool) -> Any:

@@ -62,8 +62,3 @@ def clock_ahead_s(scans_s: Sequence[float], others_s: Sequence[float]) -> float:
         usual_s.append(middle_s)
     ahead_s = usual_s[0] - usual_s[1]
     return ahead_s if abs(ahead_s) >= MAX_STEP_BACK_S else 0.0
-
-
-def ahead_note(name: str, ahead_s: float) -> str:
-    """The notice about a clock that is ahead."""
-    return f"the clock of {name} is {ahead_s:.3f} s ahead of that of the scans by the times of recording; corrected"

@@ -3,21 +3,18 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain, islice
+from itertools import chain
 
-from fcslam.errors import SourceError
 from fcslam.records import CloudScan
-from fcslam.sources.bags.cloud_scans import valid
-from fcslam.sources.bags.codec import CLOUDS, IMU
+from fcslam.sources.bags.census import valid
+from fcslam.sources.bags.codec import CLOUDS
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.imu import ImuAxes, imu_of
-from fcslam.sources.bags.plan import BagPlan, plan_of
+from fcslam.sources.bags.plan import BagPlan
 from fcslam.sources.bags.reader import CloudStream
 from fcslam.sources.bags.robots import slashed
 from fcslam.sources.bags.rosbag import RosBag
-from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, CloudRecording, reader_of
+from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, CloudRecording
 from fcslam.sources.faults import Audit, Fault
-from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
 
@@ -32,16 +29,11 @@ class CloudBag(CloudRecording):
 
     @cached_property
     def _plan(self) -> BagPlan:
-        return plan_of(self._bag.robot, replace(self._bag.options, scan_topics=(self._topic.name,)))
+        return self._bag.planned(replace(self._bag.options, scan_topics=(self._topic.name,)))
 
     @cached_property
     def _reader(self) -> tuple[CloudReader, tuple[str, ...]]:
-        plan, where = self._plan, f"{self.path}: {self._topic.name}"
-        messages = self._bag.bag.read([self._topic])
-        first = list(islice(valid(messages, plan.scans.cloud), FIRST_MESSAGES))
-        if not first:
-            raise SourceError(f"{where}: no cloud can be read; correct the driver, or copy the bag again")
-        return reader_of(first, plan.scans.mounting(self._topic, first[0].frame), self._bag.options.cloud_band, where)
+        return self._plan.scans.whole_reader(self._topic)
 
     def survey(self, scans: ScanRange = WHOLE) -> Survey:
         """As in ``CloudRecording``."""
@@ -54,31 +46,21 @@ class CloudBag(CloudRecording):
         first_ns, last_ns = self._bag.bag.census[self._topic].span_ns
         count = len(range(self._topic.message_count)[scans.first : scans.end])
         share = count / max(self._topic.message_count, 1)
-        notes = (*self._bag.bag.notes, *notes, *self._bag.robot.notes, *plan.scans.notes, *plan.odometry_notes)
+        notes = (*self._bag.bag.notes, *notes, *self._bag.robot.notes, *plan.scans.notes, *plan.notes)
         faults = self._audit.faults()
         return Survey(count, share * (last_ns - first_ns) * 1e-9, share * track.length_m, (BAND_LASER,), faults, notes)
 
     def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:
         plan, (reader, _) = self._plan, self._reader
-        base_frame = self._bag.options.base_frame or plan.tree.usual_base
-        imu = self._bag.robot.of_type(IMU)[:1]
-        odometry = () if plan.odometry is None else plan.odometry.topics
-        stream, axes = CloudStream(reader, audit), ImuAxes(plan.tree, base_frame)
-        for message in self._bag.bag.read([*odometry, *imu, self._topic]):
+        stream = CloudStream(reader, audit)
+        for message in self._bag.bag.read([*plan.read_topics(with_images=False), *filter(None, (plan.imu,))]):
             try:
-                if message.topic == self._topic:
-                    found = [stream.add(message.number, plan.scans.cloud(message))]
-                elif message.topic in imu:
-                    reading = imu_of(message.content, message.unstamped_ns)
-                    found = [stream.add_imu(axes.row(reading, plan.imu_ahead_s))]
-                elif plan.odometry is not None:
-                    readings = plan.odometry.readings(message)
-                    late_s = plan.odometry_ahead_s
-                    found = [stream.add(message.number, each._replace(stamp=each.stamp - late_s)) for each in readings]
+                items = plan.items(message)
             except ValueError:
                 audit.add(Fault.BROKEN_MESSAGE, message.number)
                 continue
-            yield from chain.from_iterable(found)
+            for item in items:
+                yield from stream.add(message.number, item)
         yield from stream.finish()
 
 

@@ -1,6 +1,6 @@
 """Point clouds and depth images of a bag or a live robot as scans; invalid messages raise ValueError."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -38,30 +38,22 @@ _UP: Final = 0.7
 """Height of the optical axis of a camera that looks up, per metre."""
 
 
-def cloud_mounting(T_base_sensor: Transform, kind: str, frame: str) -> CloudMounting:
-    """The mounting that tf has, of a sensor with messages of type ``kind`` in ``frame``."""
-    axes = _OPTICAL if lacks_optical_frame(T_base_sensor, kind, frame) else np.eye(3)
-    heading_rad = planar(T_base_sensor)[2]
-    return CloudMounting(T_base_sensor.rotation_matrix() @ axes, np.array(T_base_sensor.translation_m), heading_rad)
-
-
-def lacks_optical_frame(T_base_sensor: Transform, kind: str, frame: str) -> bool:
-    """Whether depth images are in a frame of the camera's body: its z axis, along which they look, points up."""
-    return kind == IMAGE and "optical" not in frame and bool(T_base_sensor.rotation_matrix()[2, 2] > _UP)
-
-
-def optical_note(topic: str, frame: str) -> str:
-    """The notice about a camera that looks up by tf."""
-    return (
-        f"by tf, the camera of {topic} looks up, so '{frame}' is not its optical frame; corrected: publish a frame "
-        "with roll -90 and yaw -90 deg in it, and name that in the images"
-    )
+def cloud_mounting(T_base_sensor: Transform, kind: str, frame: str) -> tuple[CloudMounting, str]:
+    """The mounting that tf has, of a sensor with messages of type ``kind`` in ``frame``, and what is wrong with it."""
+    rotation, note = T_base_sensor.rotation_matrix(), ""
+    if kind == IMAGE and "optical" not in frame and rotation[2, 2] > _UP:
+        rotation = rotation @ _OPTICAL
+        note = (
+            f"looks up, so '{frame}' is not its optical frame; corrected: publish a frame with roll -90 and yaw -90 "
+            "deg in it, and name that in the images"
+        )
+    return CloudMounting(rotation, np.array(T_base_sensor.translation_m), planar(T_base_sensor)[2]), note
 
 
 def given_cloud_mounting(pose: GivenPose, kind: str, frame: str) -> CloudMounting:
     """The mounting that the user gives, without a height; the sensor is level."""
     x, y, theta, *upside_down = pose
-    mounting = cloud_mounting(in_space(np.array([x, y, theta])), POINT_CLOUD, frame)
+    mounting, _ = cloud_mounting(in_space(np.array([x, y, theta])), POINT_CLOUD, frame)
     turn = np.diag([1.0, -1.0, -1.0]) if any(upside_down) else np.eye(3)
     axes = _OPTICAL if kind == IMAGE or "optical" in frame else np.eye(3)
     return mounting._replace(rotation=mounting.rotation @ turn @ axes, is_height_known=False)
@@ -135,9 +127,14 @@ def _fields(content: Any) -> tuple[FloatArray, Any]:
     return points, values[name].astype(np.float64 if types[name][0].kind == "f" else np.int64)
 
 
-def longest_cloud_s(interval_s: float) -> float:
-    """The longest time that a cloud takes, given that between two clouds; 0: it is not known."""
-    return min(_OVER_INTERVAL * interval_s, LONGEST_SWEEP_S) or LONGEST_SWEEP_S
+def longest_cloud_s(headers: Iterable[tuple[float, str]]) -> float:
+    """The longest time that a cloud takes, by stamps and frames of some: it ends before the next one of its sensor."""
+    stamps: dict[str, list[float]] = {}
+    for stamp, frame in headers:
+        stamps.setdefault(frame, []).append(stamp)
+    steps_s = np.concatenate([np.empty(0), *map(np.diff, stamps.values())])
+    steps_s = steps_s[steps_s > 0.0]
+    return min(_OVER_INTERVAL * float(np.median(steps_s)), LONGEST_SWEEP_S) if len(steps_s) else LONGEST_SWEEP_S
 
 
 def notes_on_times(topic: str, kind: str, clouds: Sequence[PointCloud]) -> Iterator[str]:

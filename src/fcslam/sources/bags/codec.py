@@ -25,6 +25,7 @@ IMU = "sensor_msgs/Imu"
 """Message types that are read, as ROS 1 writes them."""
 OLD_TRANSFORMS = "tf/tfMessage"
 """The name of TRANSFORMS in early ROS 1."""
+TRANSFORM_KINDS = TRANSFORMS, OLD_TRANSFORMS
 
 NANOSECONDS = 10**9
 _LIVOX_FIELDS = """std_msgs/Header header

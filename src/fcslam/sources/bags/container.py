@@ -12,7 +12,7 @@ from weakref import finalize
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
-from fcslam.sources.bags.codec import NANOSECONDS, OLD_TRANSFORMS, TRANSFORMS
+from fcslam.sources.bags.codec import NANOSECONDS, TRANSFORM_KINDS
 from fcslam.sources.bags.records import MCAP_MAGIC, ROS1_MAGIC, SQLITE_MAGIC, DatabaseFile, RecordFile
 from fcslam.sources.logs.archive import translate_errors
 from fcslam.untrusted import ZSTD, open_file, open_unpacked
@@ -39,7 +39,7 @@ class Topic(NamedTuple):
 
 def is_transforms(topic: Topic) -> bool:
     """Whether the topic carries tf."""
-    return topic.type in (TRANSFORMS, OLD_TRANSFORMS)
+    return topic.type in TRANSFORM_KINDS
 
 
 def is_bag(path: Path, head: bytes) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from fcslam.records import GnssFix
+from fcslam.sources.bags.census import BagMessage
 from fcslam.sources.bags.messages import header_of
 from fcslam.sources.bags.rig import FARTHEST_SENSOR_M
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, mounting
@@ -29,17 +30,17 @@ class FixReader:
         self._tree, self._base_frame, self._ahead_s, self._audit = tree, base_frame, ahead_s, audit
         self._used_s = -math.inf
 
-    def read(self, number: int, content: Any, unstamped_ns: int) -> Iterator[GnssFix]:
+    def read(self, message: BagMessage) -> Iterator[GnssFix]:
         """The fix in the next message, if there is one; it is left out if it comes soon after the one before."""
         try:
-            found = fix_of(content, unstamped_ns, self._tree, self._base_frame)
+            found = fix_of(message.content, message.unstamped_ns, self._tree, self._base_frame)
         except ValueError:
             found = Fault.BROKEN_MESSAGE
         if isinstance(found, Fault):
-            self._audit.add(found, number)
+            self._audit.add(found, message.number)
             return
-        if content.status.status < NO_FIX:
-            self._audit.add(Fault.UNKNOWN_FIX, number)
+        if message.content.status.status < NO_FIX:
+            self._audit.add(Fault.UNKNOWN_FIX, message.number)
         if abs(found.stamp - self._used_s) >= FIX_INTERVAL_S:
             self._used_s = found.stamp
             yield replace(found, stamp=found.stamp - self._ahead_s)

@@ -32,6 +32,9 @@ class BagCorrection:
     """Of each laser, mounted as the bag says: where it sees the floor, which is left out. Empty: none does."""
 
 
+UNCORRECTED: Final = BagCorrection()
+
+
 @dataclass(frozen=True, slots=True)
 class BagOptions:
     """Options for one bag; None: chosen automatically."""
@@ -47,6 +50,6 @@ class BagOptions:
     base_frame: str | None = None
     robot: str | None = None
     cloud_band: CloudBand = field(default_factory=CloudBand)
-    correction: BagCorrection = field(default_factory=BagCorrection)
+    correction: BagCorrection = UNCORRECTED
     in_3d: bool = False
     """Whether point clouds are read whole, and not a band of their heights as a 2D scan."""

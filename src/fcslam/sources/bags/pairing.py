@@ -19,9 +19,11 @@ from typing import NamedTuple
 
 from fcslam.records import FloatArray
 from fcslam.sources.bags.camera import ImageMessage
+from fcslam.sources.bags.imu import ImuReading
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage
 from fcslam.sources.faults import Fault
 from fcslam.sources.motion import OdometryUpdates, moving_sweep
+from fcslam.sources.point_clouds import PointCloud
 from fcslam.sources.pose import Pose, interpolated_pose
 
 MAX_GAP_S = 1.0
@@ -59,6 +61,8 @@ _PoseMatch = tuple[Pose, Fault | None]
 """A pose and its fault."""
 
 Message = ScanMessage | ImageMessage | OdometryReading
+Item = Message | ImuReading | PointCloud
+"""What a message holds."""
 Entry = PosedScan | PosedImage | OdometryReading
 
 

@@ -1,38 +1,45 @@
-"""Decides once, before a bag is read, which of its topics and frames are read, and how."""
+"""Decides once, before the messages of a robot are read, which of its topics and frames are read, and how."""
 
 from collections.abc import Iterator, Sequence
 from itertools import chain, islice, pairwise
 from math import dist, tau
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from fcslam.config import one_line
-from fcslam.errors import SourceError
-from fcslam.records import Sweep
+from fcslam.errors import InputError, SourceError
+from fcslam.geometry import se2
+from fcslam.records import CameraModel, Sweep
 from fcslam.sources.bags.camera import Calibration, image_of
-from fcslam.sources.bags.census import BagMessage
-from fcslam.sources.bags.clocks import ahead_note, clock_ahead_s
-from fcslam.sources.bags.cloud_scans import BagScans, calibration_in, valid
+from fcslam.sources.bags.census import BagMessage, Messages, valid
+from fcslam.sources.bags.clocks import clock_ahead_s
+from fcslam.sources.bags.cloud_scans import CloudScans, calibration_in
 from fcslam.sources.bags.codec import FIX, IMU, LASER_SCANS, NANOSECONDS, ODOMETRY
 from fcslam.sources.bags.container import Topic
-from fcslam.sources.bags.messages import OdometryReading, odometry_in
-from fcslam.sources.bags.options import NO_ODOMETRY, BagCorrection, BagOptions
-from fcslam.sources.bags.pairing import Message
-from fcslam.sources.bags.rig import RecordedLaser, recorded_laser
+from fcslam.sources.bags.fixes import FixReader
+from fcslam.sources.bags.imu import ImuReader
+from fcslam.sources.bags.messages import OdometryReading, ScanMessage, odometry_in
+from fcslam.sources.bags.options import NO_ODOMETRY, UNCORRECTED, BagCorrection, BagOptions
+from fcslam.sources.bags.pairing import Item
+from fcslam.sources.bags.rig import RecordedLaser, Rig, mounted_camera, mountings_of, recorded_laser, rig_of, tilt_note
 from fcslam.sources.bags.robots import BagRobot, listed, usual
 from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
-from fcslam.sources.bags.transforms import Link, TransformTree, is_corrected
+from fcslam.sources.bags.transforms import Link, Mounting, TransformTree, is_corrected
 from fcslam.sources.contradictions import CHANGED, changed_share
+from fcslam.sources.faults import Audit
 from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.motion import LARGEST_SPEED
 from fcslam.sources.path_summary import fault_of_odometry, without_odometry
 from fcslam.sources.returns import is_apart
 
+USUAL_ODOM: Final = "odom"
+"""Frame of an odometry that names none."""
 _STRIDE = 5
 """Of the scans that show whether a robot moves, every such one is compared."""
+EACH_LASER: Final = "give one for each laser, in the same order"
 
 
 class OdometryInput(NamedTuple):
-    """Where the odometry of a bag comes from."""
+    """Where the odometry of a robot comes from."""
 
     topics: tuple[Topic, ...]
     edge: Link | None
@@ -54,23 +61,27 @@ class OdometryInput(NamedTuple):
 
 
 class BagPlan(NamedTuple):
-    """What is read from a bag for one robot, and how."""
+    """What is read of one robot, in a bag or live, and how."""
 
     topics: Topics
     tree: TransformTree
-    scans: BagScans
+    scans: CloudScans
     lasers: tuple[RecordedLaser, ...]
     odometry: OdometryInput | None
     """The chosen topic, else tf; one that says nothing is none."""
     odometry_ahead_s: float
     """The clock of the odometry against that of the scans."""
+    frames: Link
+    """Those of the odometry: parent and child, the base; usual ones where nothing names them."""
+    fixes: Topic | None
     fixes_ahead_s: float
-    """The same of the fixes."""
-    imu_ahead_s: float
-    """The same of the IMU of a robot without odometry."""
+    imu: Topic | None
+    """Of a robot without odometry, or with a 3D LiDAR."""
+    imu_reader: ImuReader
     calibration: Calibration | None
     """Of the camera; None without a camera or a readable calibration."""
-    odometry_notes: tuple[str, ...]
+    notes: tuple[str, ...]
+    """About odometry and clocks."""
 
     @property
     def stated_sweep(self) -> Sweep | None:
@@ -79,14 +90,16 @@ class BagPlan(NamedTuple):
         return first.sweep if first.ranges_at_stamp is None else None
 
     def read_topics(self, with_images: bool) -> list[Topic]:
-        """The topics of a pass over the bag."""
+        """The topics of a pass over the messages, but that of an IMU."""
         camera = (self.topics.camera,) if with_images and self.topics.camera is not None else ()
         odometry = () if self.odometry is None else self.odometry.topics
         return list(dict.fromkeys((*odometry, *self.topics.scans, *camera)))
 
-    def items(self, message: BagMessage, correction: BagCorrection) -> list[Message]:
-        """The scans, readings and images in a message; raises ValueError if it is invalid."""
+    def items(self, message: BagMessage, correction: BagCorrection = UNCORRECTED) -> list[Item]:
+        """What is read of a message; raises ValueError if it is invalid."""
         if message.topic in self.topics.scans:
+            if self.scans.is_whole(message.topic):
+                return [self.scans.cloud(message)]
             scan = self.scans.scan(message)
             if correction.sweep is not None and scan.ranges_at_stamp is None:
                 first_s, last_s = correction.sweep
@@ -98,54 +111,130 @@ class BagPlan(NamedTuple):
             ]
         if message.topic == self.topics.camera:
             return [image_of(message.content, message.topic.type, message.unstamped_ns)]
+        if message.topic == self.imu:
+            return [self.imu_reader.read(message.content, message.unstamped_ns)]
+        if self.odometry is None or message.topic not in self.odometry.topics:
+            return []
         late_s = self.odometry_ahead_s + correction.odometry_delay_s
-        readings = self.odometry.readings(message) if self.odometry else []
-        return [reading._replace(stamp=reading.stamp - late_s) for reading in readings]
+        return [reading._replace(stamp=reading.stamp - late_s) for reading in self.odometry.readings(message)]
+
+    def fix_reader(self, audit: Audit, ahead_s: float | None = None) -> FixReader:
+        """Reads the fixes; ``audit`` counts the faults. None: their clock is as the plan says."""
+        return FixReader(self.tree, self.frames[1], self.fixes_ahead_s if ahead_s is None else ahead_s, audit)
+
+    def rig(self, farthest_m: Sequence[float], options: BagOptions) -> tuple[Rig, list[str]]:
+        """The mounted lasers, with these largest ranges, and the camera, and notes about them.
+
+        Raises:
+            NoTransformError: tf does not say where a laser sits, yet.
+            InputError: a laser cannot be read as it is mounted.
+        """
+        poses, base_frame = options.laser_poses, self.frames[1]
+        if poses and len(poses) != len(self.lasers):
+            named = ", ".join(laser.name for laser in self.lasers)
+            raise InputError(f"{len(poses)} laser-pose for the lasers {named}; {EACH_LASER}")
+        mountings = [
+            _moved(mounted, options.correction) for mounted in mountings_of(self.lasers, self.tree, base_frame, poses)
+        ]
+        notes = [
+            f"the laser of {laser.name} is {tilt}"
+            for laser, mounted in zip(self.lasers, mountings, strict=True)
+            if (tilt := tilt_note(mounted))
+        ]
+        camera: CameraModel | None = None
+        if self.topics.camera is not None:
+            camera, note = mounted_camera(self.calibration, self.tree, base_frame)
+            notes += [f"the camera of {self.topics.camera.name} {note}"] if note else []
+        return rig_of(self.lasers, farthest_m, mountings, camera), notes
 
 
-def plan_of(robot: BagRobot, options: BagOptions) -> BagPlan:
-    """Plan how a robot of a bag is read."""
-    return _Planner(robot, options).plan()
+def plan_of(robot: BagRobot, options: BagOptions, topics: Topics | None = None) -> BagPlan:
+    """Plan how a robot is read, on these ``topics``; None: they are chosen.
+
+    Raises:
+        NoTransformError: tf does not say where a sensor sits, yet.
+        SourceError: the robot cannot be read.
+    """
+    return _Planner(robot, options, topics).plan()
+
+
+def clock_ahead(bag: Messages, laser: RecordedLaser, name: str, lags_s: Sequence[float]) -> tuple[float, str]:
+    """How far the clock of the sensor ``name`` with these lags is ahead of that of the scans, which are stamped before
+    they end, and a line that says it; 0 and empty if they agree.
+    """
+    scans_s = [lag_s - laser.first.duration_s for lag_s in bag.census[laser.topic].clock.lags_s]
+    ahead_s = clock_ahead_s(scans_s, lags_s)
+    if not ahead_s:
+        return 0.0, ""
+    said = f"{ahead_s:.3f} s ahead of that of the scans by the times of recording; corrected"
+    return ahead_s, f"{bag.label}the clock of {name} is {said}"
 
 
 class _Planner:
-    def __init__(self, robot: BagRobot, options: BagOptions) -> None:
-        self._robot, self._options, self._bag, self._path = robot, options, robot.bag, robot.bag.path
-        known = KnownTopics(robot.topics, robot.transforms, f"{robot.bag.path}: ")
-        self._topics = choose_topics(
-            known, options, self._view_rad, lambda topic: self._jumps(topic) or self._leaps(topic)
+    def __init__(self, robot: BagRobot, options: BagOptions, topics: Topics | None) -> None:
+        self._robot, self._options, self._bag, self._label = robot, options, robot.bag, robot.bag.label
+        self._topics = topics or choose_topics(
+            KnownTopics(robot.topics, robot.transforms, self._label),
+            options,
+            self._view_rad,
+            lambda topic: self._jumps(topic) or self._leaps(topic),
         )
         self._tree = robot.bag.tree(robot.transforms)
-        self._scans = BagScans(robot, self._topics.scans, options, self._tree, self._base_frame_of)
+        self._scans = CloudScans(robot, self._topics.scans, options, self._tree, self._base_frame_of)
         self._notes: list[str] = []
 
     def plan(self) -> BagPlan:
         """Decide everything."""
-        topics = self._topics
+        topics, bag = self._topics, self._bag
         lasers = tuple(
             self._laser(topic, frame)
             for topic in topics.scans
             for frame in self._robot.scan_frames.get(topic.name, (None,))
         )
         odometry = self._odometry(lasers[0].first.frame)
-        ahead_s = fixes_ahead_s = imu_ahead_s = 0.0
+        frames = self._frames(odometry)
+        needs_imu = odometry is None or self._scans.is_whole(lasers[0].topic)
+        fixes, imu = next(iter(self._robot.of_type(FIX)), None), next(iter(self._robot.of_type(IMU)), None)
+        imu = imu if needs_imu else None
+        lags_s = {each.name: bag.census[each].clock.lags_s for each in (fixes, imu) if each is not None}
         if odometry is not None:
-            ahead_s = self._ahead_s(lasers[0], odometry.name, self._lags_s(odometry))
-        for fixes in self._robot.of_type(FIX)[:1]:
-            fixes_ahead_s = self._ahead_s(lasers[0], fixes.name, self._bag.census[fixes].clock.lags_s)
-        for imu in self._robot.of_type(IMU)[:1] if odometry is None else ():
-            imu_ahead_s = self._ahead_s(lasers[0], imu.name, self._bag.census[imu].clock.lags_s)
-        calibration = calibration_in(self._robot, topics.camera_info)
-        notes = tuple(self._notes)
-        clocks_s = ahead_s, fixes_ahead_s, imu_ahead_s
-        return BagPlan(topics, self._tree, self._scans, lasers, odometry, *clocks_s, calibration, notes)
+            lags_s = {odometry.name: self._lags_s(odometry), **lags_s}
+        clocks = {name: clock_ahead(bag, lasers[0], name, each_s) for name, each_s in lags_s.items()}
+        odometry_ahead_s, fixes_ahead_s, imu_ahead_s = (
+            clocks[each.name][0] if each is not None else 0.0 for each in (odometry, fixes, imu)
+        )
+        self._notes += [note for _, note in clocks.values() if note]
+        return BagPlan(
+            topics,
+            self._tree,
+            self._scans,
+            lasers,
+            odometry,
+            odometry_ahead_s,
+            frames,
+            fixes,
+            fixes_ahead_s,
+            imu,
+            ImuReader(self._tree, frames[1], imu_ahead_s),
+            calibration_in(self._robot, topics.camera_info),
+            tuple(self._notes),
+        )
+
+    def _frames(self, odometry: OdometryInput | None) -> Link:
+        if odometry is None:
+            return USUAL_ODOM, self._options.base_frame or self._tree.usual_base
+        if odometry.edge is not None:
+            return odometry.edge
+        its = self._bag.census[odometry.topics[0]]
+        bases = (self._options.base_frame, odometry.base_frame, *its.frames)
+        return min(filter(None, its.odom_frames), default=USUAL_ODOM), next(filter(None, bases), self._tree.usual_base)
 
     def _laser(self, topic: Topic, frame: str | None) -> RecordedLaser:
-        own = (scan for scan in self._scans.of(topic) if frame in (None, scan.frame))
+        own = (scan for scan in self._valid_scans(topic) if frame in (None, scan.frame))
         first = list(islice(own, FIRST_MESSAGES))
         if not first:
             raise SourceError(
-                f"{self._path}: none of the {topic.message_count} scans in {topic.name} can be read"
+                f"{self._label}none of the {topic.message_count} scans in {topic.name} can be read"
                 f"{self._first_error(topic)}; correct the laser's driver, or copy the bag again"
             )
         return recorded_laser(topic, first, frame)
@@ -168,10 +257,10 @@ class _Planner:
             fault = f"cannot be read ({error})" if error else fault_of_odometry(each.T_odom_base for each in readings)
             if fault is None or not (error or self._scans_change()):
                 return candidate
-            self._notes.append(f"{self._path}: {candidate.name} {fault}, so it is not used")
+            self._notes.append(f"{self._label}{candidate.name} {fault}, so it is not used")
         its = self._bag.census[self._topics.scans[0]]
         interval_s = (its.span_ns[1] - its.span_ns[0]) / (max(1, its.count - 1) * NANOSECONDS)
-        self._notes.append(f"{self._path}: {without_odometry(interval_s)}")
+        self._notes.append(f"{self._label}{without_odometry(interval_s)}")
         return None
 
     def _odometry_candidates(self, frame: str) -> Iterator[OdometryInput]:
@@ -192,7 +281,7 @@ class _Planner:
         elif options.odom_frame or (options.base_frame and not measured):
             known = ", ".join(f"{one_line(parent)} -> {one_line(child)}" for parent, child in self._tree.links)
             raise SourceError(
-                f"{self._path}: tf has no transform from {options.odom_frame or 'a frame'} to "
+                f"{self._label}tf has no transform from {options.odom_frame or 'a frame'} to "
                 f"{options.base_frame or 'a frame above the laser'}; give --sensors odom-frame and base-frame; "
                 f"tf has {known or 'no transforms'}"
             )
@@ -209,7 +298,7 @@ class _Planner:
         if chosen in frames:
             return chosen
         raise SourceError(
-            f"{self._path}: {topic.name} has odometry of the frames {listed(frames)}, and tf does not say which one "
+            f"{self._label}{topic.name} has odometry of the frames {listed(frames)}, and tf does not say which one "
             "the laser is on; choose one by --sensors base-frame"
         )
 
@@ -221,22 +310,15 @@ class _Planner:
         return next(filter(None, (*bases, *(link or ())[1:])), self._tree.usual_base)
 
     def _scans_change(self) -> bool:
-        found = self._scans.of(self._topics.scans[0])
+        found = self._valid_scans(self._topics.scans[0])
         first = next(found, None)
         return first is not None and any(
             changed_share(first.raw_ranges_m, scan.raw_ranges_m) > CHANGED
             for scan in islice(found, None, None, _STRIDE)
         )
 
-    def _ahead_s(self, laser: RecordedLaser, name: str, lags_s: Sequence[float]) -> float:
-        """How far the clock of a sensor with these lags is ahead of that of the scans, which are stamped before they
-        end.
-        """
-        scans_s = self._bag.census[laser.topic].clock.lags_s
-        ahead_s = clock_ahead_s([lag_s - laser.first.duration_s for lag_s in scans_s], lags_s)
-        if ahead_s:
-            self._notes.append(f"{self._path}: {ahead_note(name, ahead_s)}")
-        return ahead_s
+    def _valid_scans(self, topic: Topic) -> Iterator[ScanMessage]:
+        return valid(self._bag.read([topic]), self._scans.scan)
 
     def _lags_s(self, odometry: OdometryInput) -> list[float]:
         """Times from the stamps to the recording of the first readings."""
@@ -264,3 +346,9 @@ class _Planner:
             return tau
         scan = next(valid(self._bag.read([topic]), lambda message: message.content), None)
         return 0.0 if scan is None else scan.beams.span_rad
+
+
+def _moved(mounted: Mounting, correction: BagCorrection) -> Mounting:
+    x, y, theta = se2.compose(correction.mounting, mounted.T_base_laser).tolist()
+    mounted = mounted._replace(upside_down=mounted.upside_down != correction.upside_down)
+    return mounted._replace(T_base_laser=(x, y, theta)) if any(correction.mounting) else mounted

@@ -12,8 +12,9 @@ import numpy as np
 
 from fcslam.records import CloudScan, FloatArray, frozen
 from fcslam.sources.bags.camera import ImageMessage
+from fcslam.sources.bags.imu import ImuReading
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage
-from fcslam.sources.bags.pairing import Entry, Message, OdometryPairing, PosedImage, PosedScan
+from fcslam.sources.bags.pairing import Entry, Item, Message, OdometryPairing, PosedImage, PosedScan
 from fcslam.sources.bags.rig import RecordedLaser
 from fcslam.sources.bags.sectors import SectorJoiner
 from fcslam.sources.clouds_in_space import CloudReader
@@ -81,11 +82,11 @@ class _Readings:
     """Readings of a sensor that no scan was given yet: rows that begin with their stamps."""
 
     def __init__(self, columns: int) -> None:
-        self._rows: deque[list[float]] = deque()
+        self._rows: deque[tuple[float, ...]] = deque()
         self._columns = columns
         self.newest_s = -np.inf
 
-    def add(self, row: list[float]) -> None:
+    def add(self, *row: float) -> None:
         self._rows.append(row)
         self.newest_s = row[0]
 
@@ -104,31 +105,31 @@ class SensorReader:
         lasers: Sequence[RecordedLaser],
         has_odometry: bool,
         audit: Audit,
-        imu: Iterable[list[float]] = (),
+        imu: Iterable[ImuReading] = (),
     ) -> None:
         """``audit`` counts the faults; ``imu`` are readings of the IMU of a robot without odometry."""
         self._joiners = {number: SectorJoiner() for number, laser in enumerate(lasers) if laser.is_in_sectors}
         self._merger = ScanMerger(len(lasers))
         self._pairing = OdometryPairing() if has_odometry else None
         self._imu = _Readings(7)
-        for row in imu:
-            self._imu.add(row)
+        for reading in imu:
+            self._imu.add(reading.stamp, *reading.values)
         self._gates, self._audit = [ScanGate(laser.first.beams, audit) for laser in lasers], audit
         self._number = 0
 
-    def add(self, number: int, item: Message) -> Iterator[Numbered]:
-        """Read the next item of message ``number``; yields the entries that wait no longer."""
-        self._number = number
-        joined: Iterable[Message] = (item,)
-        if isinstance(item, ScanMessage) and item.laser in self._joiners:
-            joined = self._joiners[item.laser].add(item)
-        for each in joined:
-            yield from self._posed(self._merger.add(number, each))
+    def add(self, number: int, item: Item) -> Iterator[Numbered]:
+        """Read the next item of message ``number``; yields the entries that wait no longer.
 
-    def add_imu(self, row: list[float]) -> Iterator[Numbered]:
-        """Read the next row of ``ImuAxes`` of a robot without odometry; nothing waits for it."""
-        self._imu.add(row)
-        return iter(())
+        Nothing waits for an IMU; clouds are read by ``CloudStream``.
+        """
+        self._number = number
+        if isinstance(item, ImuReading):
+            self._imu.add(item.stamp, *item.values)
+        elif isinstance(item, ScanMessage) and item.laser in self._joiners:
+            for turn in self._joiners[item.laser].add(item):
+                yield from self._posed(self._merger.add(number, turn))
+        elif not isinstance(item, PointCloud):
+            yield from self._posed(self._merger.add(number, item))
 
     def finish(self) -> Iterator[Numbered]:
         """Yield all that waits, as no more messages come."""
@@ -200,21 +201,19 @@ class CloudStream:
         self._waiting: deque[tuple[int, PointCloud]] = deque()
         self._newest_s = -np.inf
 
-    def add(self, number: int, item: PointCloud | OdometryReading) -> Iterator[tuple[int, CloudScan]]:
+    def add(self, number: int, item: Item) -> Iterator[tuple[int, CloudScan]]:
         """Read the next cloud or reading of message ``number``; yields the clouds that wait no longer."""
         if isinstance(item, OdometryReading):
-            self._wheels.add([item.stamp, *item.T_odom_base])
-        elif -MAX_STEP_BACK_S < item.stamp - self._newest_s <= 0.0:
+            self._wheels.add(item.stamp, *item.T_odom_base)
+        elif isinstance(item, ImuReading):
+            self._imu.add(item.stamp, *item.values)
+        elif isinstance(item, PointCloud) and -MAX_STEP_BACK_S < item.stamp - self._newest_s <= 0.0:
             self._audit.add(Fault.REPEATED_STAMP, number)
-        else:
+        elif isinstance(item, PointCloud):
             self._newest_s = item.stamp
             self._waiting.append((number, item))
-        yield from self._complete()
-
-    def add_imu(self, row: list[float]) -> Iterator[tuple[int, CloudScan]]:
-        """Read stamp, angular velocity and specific force in the axes of the base."""
-        self._imu.add(row)
-        yield from self._complete()
+        while self._waiting and (len(self._waiting) > _MOST_CLOUDS or self._is_covered(self._waiting[0][1])):
+            yield from self._next()
 
     @property
     def waits_for_odometry(self) -> bool:
@@ -231,10 +230,6 @@ class CloudStream:
             yield from self._next()
 
     finish = skip_odometry
-
-    def _complete(self) -> Iterator[tuple[int, CloudScan]]:
-        while self._waiting and (len(self._waiting) > _MOST_CLOUDS or self._is_covered(self._waiting[0][1])):
-            yield from self._next()
 
     def _is_covered(self, cloud: PointCloud) -> bool:
         end_s = cloud.stamp + float(cloud.times_s.max(initial=0.0))

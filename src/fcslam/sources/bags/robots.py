@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from fcslam.config import one_line
 from fcslam.errors import SourceError
-from fcslam.sources.bags.census import DecodedBag
+from fcslam.sources.bags.census import Messages
 from fcslam.sources.bags.codec import COMPRESSED_IMAGE, IMAGE, ODOMETRY, SCANS
 from fcslam.sources.bags.container import Topic, is_transforms
 from fcslam.sources.bags.options import BagOptions
@@ -27,7 +27,7 @@ _TRUTHS = ("ground_truth", "groundtruth")
 class BagRobot(NamedTuple):
     """The topics of a bag that belong to one robot, and its frames on topics that have several."""
 
-    bag: DecodedBag
+    bag: Messages
     name: str
     """A namespace or the prefix of frames, with a slash in front."""
     topics: tuple[Topic, ...]
@@ -67,7 +67,7 @@ class _Member:
         return self.tree.robot(frame) == self.tree.robot(self.frame) or _prefix(frame) == _prefix(self.frame) != ""
 
 
-def robots_of(bag: DecodedBag, options: BagOptions) -> tuple[BagRobot, ...]:
+def robots_of(bag: Messages, options: BagOptions) -> tuple[BagRobot, ...]:
     """The robots of a bag, or those that have the topics that ``options`` name; one or more, by name."""
     heard = tuple(topic for topic in bag.topics if topic.message_count)
     members, spaces = _members(heard, bag)
@@ -103,7 +103,7 @@ def _is_apart(member: _Member, robot: _Member) -> bool:
     return bool(robot.space and member.space) and not set(member.transforms) & set(robot.transforms)
 
 
-def robot_of(bag: DecodedBag, options: BagOptions) -> BagRobot:
+def robot_of(bag: Messages, options: BagOptions) -> BagRobot:
     """The only robot of a bag, or the one that ``options`` name."""
     if options.robot is None:
         robots = robots_of(bag, options)
@@ -116,7 +116,7 @@ def robot_of(bag: DecodedBag, options: BagOptions) -> BagRobot:
             if slashed(robot.name) == slashed(options.robot):
                 return robot
         problem = f"has no robot {one_line(slashed(options.robot))}, it has {_named(robots)}"
-    raise SourceError(f"{bag.path}: {problem}; choose one, as in {bag.path.name}:{robots[0].name}")
+    raise SourceError(f"{bag.label}{problem}; choose one, as in {bag.path.name}:{robots[0].name}")
 
 
 def _named(robots: Sequence[BagRobot]) -> str:
@@ -138,7 +138,7 @@ def usual(counts: Mapping[str, int]) -> tuple[str, ...]:
     return tuple(name for name, count in counts.items() if count > TOLERATED_SHARE * sum(counts.values()))
 
 
-def _members(heard: Sequence[Topic], bag: DecodedBag) -> tuple[list[_Member], set[str]]:
+def _members(heard: Sequence[Topic], bag: Messages) -> tuple[list[_Member], set[str]]:
     """The scans that belong together, with their odometry, and the namespaces of robots."""
     census = bag.census
     scans = [topic for topic in heard if topic.type in SCANS]
@@ -177,7 +177,7 @@ def _spaces(scans: Sequence[Topic], marks: Sequence[Topic]) -> dict[Topic, str]:
     }
 
 
-def _only_robot(bag: DecodedBag, members: Sequence[_Member], options: BagOptions) -> BagRobot:
+def _only_robot(bag: Messages, members: Sequence[_Member], options: BagOptions) -> BagRobot:
     """The robot that has all topics of a bag, but odometry of other frames or namespaces if it has its own."""
     heard = [topic for topic in bag.topics if topic.message_count]
     sensors = [topic for topic in heard if topic.type in (*SCANS, COMPRESSED_IMAGE, IMAGE)]
@@ -203,7 +203,7 @@ def _only_robot(bag: DecodedBag, members: Sequence[_Member], options: BagOptions
     if options.odom_topic or options.laser_poses or not (fitting or member.tree.robot(member.frame)[0]):
         apart = []
     notes = tuple(
-        f"{bag.path}: {topic.name} is not used, as its namespace or frames are not those of the laser, "
+        f"{bag.label}{topic.name} is not used, as its namespace or frames are not those of the laser, "
         f"'{one_line(member.frame)}' (--sensors odom-topic chooses)"
         for topic in apart
     )
@@ -212,19 +212,19 @@ def _only_robot(bag: DecodedBag, members: Sequence[_Member], options: BagOptions
     return BagRobot(bag, name, topics, tuple(sorted(transforms)), scan_frames, base_frames, notes)
 
 
-def _lost_scans(bag: DecodedBag, robots: Sequence[_Member], members: Sequence[_Member]) -> tuple[str, ...]:
+def _lost_scans(bag: Messages, robots: Sequence[_Member], members: Sequence[_Member]) -> tuple[str, ...]:
     notes = []
     for member in members:
         for topic, frames in () if member in robots else member.scan_frames.items():
             for robot in robots:
                 if topic in robot.scan_frames:
                     raise SourceError(
-                        f"{bag.path}: {topic.name} has scans of the frames {listed(robot.scan_frames[topic])} and "
+                        f"{bag.label}{topic.name} has scans of the frames {listed(robot.scan_frames[topic])} and "
                         f"{listed(frames)}, and tf does not say which robot the last are of; record /tf and /tf_static "
                         "of all robots"
                     )
             notes.append(
-                f"{bag.path}: scans of {listed(frames)} on {topic.name} belong to no robot with odometry; not used"
+                f"{bag.label}scans of {listed(frames)} on {topic.name} belong to no robot with odometry; not used"
             )
     return tuple(notes)
 

@@ -6,6 +6,7 @@ counted. A robot that stands still is accepted, because a topic shows that there
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain, repeat
@@ -13,22 +14,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fcslam.errors import InputError, SourceError
-from fcslam.geometry import se2
 from fcslam.records import GnssFix, Odometry, SensorRecord, frozen
-from fcslam.sources.bags.census import DecodedBag
-from fcslam.sources.bags.cloud_scans import valid
-from fcslam.sources.bags.codec import FIX, IMU
+from fcslam.sources.bags.census import DecodedBag, Messages, valid
 from fcslam.sources.bags.container import is_transforms
-from fcslam.sources.bags.fixes import FixReader
-from fcslam.sources.bags.imu import ImuAxes, imu_of
+from fcslam.sources.bags.imu import ImuReading
 from fcslam.sources.bags.messages import OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Entry, PosedScan
-from fcslam.sources.bags.plan import BagPlan, plan_of
+from fcslam.sources.bags.plan import EACH_LASER, BagPlan, plan_of
 from fcslam.sources.bags.reader import Numbered, SensorReader
-from fcslam.sources.bags.rig import Rig, mounted_camera, mountings_of, rig_of, tilt_note
+from fcslam.sources.bags.rig import Rig
 from fcslam.sources.bags.robots import BagRobot, robot_of, robots_of, slashed
-from fcslam.sources.bags.transforms import Mounting, NoTransformError
+from fcslam.sources.bags.transforms import NoTransformError
 from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
 from fcslam.sources.gate import check_consistency, scan_window
@@ -37,8 +34,6 @@ from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import WHOLE, ScanRange, Survey
 
 _audit = partial(Audit, "message")
-_EACH_LASER = "give one for each laser, in the same order"
-
 _OF_SCANS = "its range_min and range_max"
 _OF_CLOUDS = "that a cloud is a whole turn, its points are in metres, its mounting in tf and the heights of cloud-band"
 
@@ -47,7 +42,6 @@ class _Reading(NamedTuple):
     survey: Survey
     rig: Rig
     placeholders: tuple[tuple[float, ...], ...]
-    base_frame: str
 
 
 class RosBag:
@@ -69,9 +63,9 @@ class RosBag:
         topics, poses = self.options.scan_topics, self.options.laser_poses
         if topics and 0 < len(poses) < len(topics):
             raise SourceError(
-                f"{path}: {len(poses)} laser-pose for {len(topics)} scan-topic of --sensors; {_EACH_LASER}"
+                f"{path}: {len(poses)} laser-pose for {len(topics)} scan-topic of --sensors; {EACH_LASER}"
             )
-        self.bag = DecodedBag(path) if robot is None else robot.bag
+        self.bag: Messages = DecodedBag(path) if robot is None else robot.bag
         self._given_robot = robot
         self._audit = _audit()
 
@@ -83,7 +77,29 @@ class RosBag:
     @cached_property
     def plan(self) -> BagPlan:
         """What is read, and how."""
-        return plan_of(self.robot, self.options)
+        return self.planned(self.options)
+
+    def planned(self, options: BagOptions) -> BagPlan:
+        """A plan by other options."""
+        with self._translated():
+            return plan_of(self.robot, options)
+
+    @contextmanager
+    def _translated(self, errors: Mapping[str, str] | None = None) -> Iterator[None]:
+        """Translate errors of mountings to SourceError; ``errors`` are those of messages."""
+        try:
+            yield
+        except NoTransformError as error:
+            each = " for each laser" * (len(self.options.scan_topics) > 1)
+            raise SourceError(
+                f"{self.path}: tf has {error}{_in_brackets(errors or {})}; give it with --sensors "
+                f"laser-pose=X,Y,THETA (metres, radians){each}; if it is in another part of this recording, give both "
+                "joined by a comma"
+            ) from error
+        except SourceError:
+            raise
+        except InputError as error:
+            raise SourceError(f"{self.path}: {error}") from error
 
     @property
     def faults(self) -> Faults:
@@ -135,21 +151,18 @@ class RosBag:
                     audit.add(Fault.BROKEN_IMAGE, number)
 
     @cached_property
-    def _imu(self) -> list[list[float]]:
+    def _imu(self) -> list[ImuReading]:
         """The readings of the IMU of a robot without odometry."""
-        if self.plan.odometry is not None:
+        if self.plan.imu is None:
             return []
-        axes = ImuAxes(self.plan.tree, self._reading.base_frame)
-        messages = self.bag.read(self.robot.of_type(IMU)[:1])
-        readings = valid(messages, lambda each: imu_of(each.content, each.unstamped_ns))
-        return sorted(axes.row(each, self.plan.imu_ahead_s) for each in readings)
+        items = chain.from_iterable(valid(self.bag.read([self.plan.imu]), self.plan.items))
+        return sorted(item for item in items if isinstance(item, ImuReading))
 
     @cached_property
     def _fixes(self) -> tuple[tuple[GnssFix, ...], Faults]:
         audit, plan = _audit(), self.plan
-        reader = FixReader(plan.tree, self._reading.base_frame, plan.fixes_ahead_s, audit)
-        messages = self.bag.read(self.robot.of_type(FIX)[:1])
-        found = chain.from_iterable(reader.read(each.number, each.decoded, each.unstamped_ns) for each in messages)
+        messages = self.bag.read([] if plan.fixes is None else [plan.fixes])
+        found = chain.from_iterable(map(plan.fix_reader(audit).read, messages))
         return tuple(sorted(found, key=lambda fix: fix.stamp)), audit.faults()
 
     def _entries(
@@ -157,7 +170,7 @@ class RosBag:
         audit: Audit,
         errors: dict[str, str] | None = None,
         with_images: bool = False,
-        imu: Iterable[list[float]] = (),
+        imu: Iterable[ImuReading] = (),
     ) -> Iterator[Numbered]:
         plan, errors = self.plan, {} if errors is None else errors
         reader = SensorReader(plan.lasers, plan.odometry is not None, audit, imu)
@@ -176,11 +189,10 @@ class RosBag:
     @cached_property
     def _reading(self) -> _Reading:
         audit, errors, plan = _audit(), dict[str, str](), self.plan
-        tree, lasers = plan.tree, plan.lasers
+        lasers = plan.lasers
         scans, odometry = PathSummary(), PathSummary()
         samples = [RangeSample(laser.topic.message_count) for laser in lasers]
         farthest_m = [laser.first.range_max_m for laser in lasers]
-        base_frame = self.options.base_frame or ""
         for topic in plan.topics.transforms:
             census = self.bag.census[topic]
             if census.broken and topic not in (plan.odometry.topics if plan.odometry else ()):
@@ -194,17 +206,13 @@ class RosBag:
                 scans.add(scan.stamp, pose)
             elif isinstance(entry, OdometryReading):
                 odometry.add(entry.stamp, entry.T_odom_base)
-                base_frame = base_frame or entry.base_frame
         self._refuse(audit.faults(), scans, odometry, errors)
         which = [f" of {laser.name}" for laser in lasers]
         for sample, its, recorded in zip(samples, which, lasers, strict=True):
             sample.check(self.path, its, _OF_CLOUDS if recorded.is_level else _OF_SCANS)
         placeholders = tuple(sample.placeholders() for sample in samples)
-        base_frame = base_frame or tree.usual_base
-        mountings = [_moved(mounted, self.options.correction) for mounted in self._mountings(base_frame, errors)]
-        camera, camera_note = None, ""
-        if plan.topics.camera is not None:
-            camera, camera_note = mounted_camera(plan.calibration, tree, base_frame)
+        with self._translated(errors):
+            rig, rig_notes = plan.rig(farthest_m, self.options)
         notes = [
             *self.bag.notes,
             *(
@@ -218,20 +226,12 @@ class RosBag:
             *chain.from_iterable(map(placeholder_note, repeat(self.path), placeholders, which)),
             *self.robot.notes,
             *plan.topics.notes,
-            *plan.odometry_notes,
-            *(
-                f"{self.path}: the laser{its * (len(which) > 1)} is {tilt}"
-                for its, mounted in zip(which, mountings, strict=True)
-                if (tilt := tilt_note(mounted))
-            ),
+            *plan.notes,
+            *(f"{self.path}: {note}" for note in rig_notes),
         ]
-        if plan.topics.camera is not None and camera_note:
-            notes.append(f"{self.path}: the camera of {plan.topics.camera.name} {camera_note}")
-        rig = rig_of(lasers, farthest_m, mountings, camera)
-        survey = Survey(
-            scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), (*self._notes, *notes), camera
-        )
-        return _Reading(survey, rig, placeholders, base_frame)
+        faults, notes = audit.faults(), [*self._notes, *notes]
+        survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, faults, tuple(notes), rig.camera)
+        return _Reading(survey, rig, placeholders)
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary, errors: Mapping[str, str]) -> None:
         path, topics, (laser, *_) = self.path, self.plan.topics, self.plan.lasers
@@ -245,22 +245,6 @@ class RosBag:
                 f"{odometry.latest:.3f} s; record both by one clock, all the way, or map without odometry by --sensors "
                 "odom-topic=none"
             )
-
-    def _mountings(self, base_frame: str, errors: Mapping[str, str]) -> list[Mounting]:
-        lasers, poses = self.plan.lasers, self.options.laser_poses
-        if poses and len(poses) != len(lasers):
-            named = ", ".join(laser.name for laser in lasers)
-            raise SourceError(f"{self.path}: {len(poses)} laser-pose for the lasers {named}; {_EACH_LASER}")
-        try:
-            return mountings_of(lasers, self.plan.tree, base_frame, poses)
-        except InputError as error:
-            raise SourceError(f"{self.path}: {error}") from error
-        except NoTransformError as error:
-            raise SourceError(
-                f"{self.path}: tf has {error}{_in_brackets(errors)}; give it with --sensors laser-pose=X,Y,THETA "
-                f"(metres, radians){' for each laser' * (len(lasers) > 1)}; if it is in another part of this "
-                "recording, give both joined by a comma"
-            ) from error
 
     @property
     def is_upside_down(self) -> bool:
@@ -300,12 +284,6 @@ class RosBag:
             options = replace(options, scan_topics=topics, laser_poses=poses)
         called = "_".join(filter(None, (name, robot.name.strip("/").replace("/", "_")))) or self.name
         return RosBag(self.path, called, options, self._notes, robot)
-
-
-def _moved(mounted: Mounting, correction: BagCorrection) -> Mounting:
-    x, y, theta = se2.compose(correction.mounting, mounted.T_base_laser).tolist()
-    mounted = mounted._replace(upside_down=mounted.upside_down != correction.upside_down)
-    return mounted._replace(T_base_laser=(x, y, theta)) if any(correction.mounting) else mounted
 
 
 def _is_scan(entry: Entry) -> bool:

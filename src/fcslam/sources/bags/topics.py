@@ -12,11 +12,10 @@ from fcslam.sources.bags.codec import (
     IMAGE,
     LASER_SCANS,
     ODOMETRY,
-    OLD_TRANSFORMS,
     POINT_CLOUD,
     SCAN,
     SCANS,
-    TRANSFORMS,
+    TRANSFORM_KINDS,
 )
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.options import NO_ODOMETRY, BagOptions
@@ -26,7 +25,7 @@ from fcslam.sources.bags.transforms import last_part
 
 _NEEDED: Mapping[str, tuple[tuple[str, ...], str]] = {
     "--sensors scan-topic": ((*SCANS, IMAGE), f"{SCAN}, {POINT_CLOUD} or a depth image"),
-    "--sensors odom-topic": ((ODOMETRY, TRANSFORMS, OLD_TRANSFORMS), f"{ODOMETRY}, or tf"),
+    "--sensors odom-topic": ((ODOMETRY, *TRANSFORM_KINDS), f"{ODOMETRY}, or tf"),
     "--sensors camera-topic": ((COMPRESSED_IMAGE, IMAGE), f"{COMPRESSED_IMAGE} or {IMAGE}"),
 }
 """Types of the topics that each option may name."""
