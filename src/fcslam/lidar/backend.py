@@ -90,6 +90,8 @@ class LidarBackend:
 
     def _finish_submap(self, at_end: bool = False) -> FinishedSubmap | None:
         gate, window = self._gate, self._window
+        if not at_end and window[-1].travel_m < self._next_anchor_m + SUBMAP_REACH_M:
+            return None
         travel = [keyscan.travel_m for keyscan in window]
         middle = bisect_left(travel, self._next_anchor_m)
         if middle == len(window) or (not at_end and travel[-1] < travel[middle] + SUBMAP_REACH_M):

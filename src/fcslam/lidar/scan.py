@@ -219,7 +219,7 @@ def _fit_normal(points, connected, k, origin, normals):  # type: ignore[no-untyp
 @njit(allocates=False)
 def _across(difference, mixed):  # type: ignore[no-untyped-def]
     """Unit normal of the line along half the angle of (difference, mixed), without trigonometric functions."""
-    length = np.hypot(difference, mixed)
+    length = np.sqrt(difference * difference + mixed * mixed)
     if length == 0.0:
         return 0.0, 1.0
     if difference >= 0.0:
@@ -241,6 +241,11 @@ def _is_connected(points, kept, ranges, spacing, i):  # type: ignore[no-untyped-
     return dx * dx + dy * dy < limit * limit
 
 
+@njit(allocates=False)
+def _distance(a, b):  # type: ignore[no-untyped-def]
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2)  # in a third of the time of np.hypot
+
+
 @njit
 def _thin(points, normals, solitary, times, spacing, limit, radius):  # type: ignore[no-untyped-def]
     keep = np.empty(len(points), np.int64)
@@ -248,13 +253,13 @@ def _thin(points, normals, solitary, times, spacing, limit, radius):  # type: ig
     step = before = 0.0  # the last two distances of consecutive returns; the lesser leaves out gaps
     for i in range(len(points)):
         if i > 1:
-            step, before = np.hypot(points[i - 1, 0] - points[i - 2, 0], points[i - 1, 1] - points[i - 2, 1]), step
+            step, before = _distance(points[i - 1], points[i - 2]), step
         if points[i, 0] ** 2 + points[i, 1] ** 2 >= radius * radius:
             continue
         if n > 0:
             last = points[keep[n - 1]]
-            expected = np.hypot(points[i - 1, 0] - last[0], points[i - 1, 1] - last[1]) + min(step, before)
-            is_post = solitary[i] and np.hypot(points[i, 0] - last[0], points[i, 1] - last[1]) >= GAP_SPACINGS * spacing
+            expected = _distance(points[i - 1], last) + min(step, before)
+            is_post = solitary[i] and _distance(points[i], last) >= GAP_SPACINGS * spacing
             if expected < spacing and not is_post:
                 continue
         keep[n] = i

@@ -62,6 +62,10 @@ _BOUNDS: dict[type, dict[str, tuple[float, float]]] = {
     DetectorUpdate: {"file.format": _NUMBER, "file.size": (1, MOST_NETWORK_BYTES)},
 }
 """Lowest and highest value of each number of a record."""
+_LIMITS = {
+    record: tuple((path, attrgetter(path), *limits) for path, limits in bounds.items())
+    for record, bounds in _BOUNDS.items()
+}
 _MOST_MOTION = 50.0, 500.0
 """Largest velocity and acceleration during a scan: m/s and rad/s, m/s^2 and rad/s^2."""
 _ANTENNA_M = 1000.0
@@ -106,8 +110,8 @@ def check(packet: Packet) -> None:
 
 
 def _check_numbers(record: object) -> None:
-    for path, (low, high) in _BOUNDS.get(type(record), {}).items():
-        value = attrgetter(path)(record)
+    for path, number, low, high in _LIMITS.get(type(record), ()):
+        value = number(record)
         if not low <= value <= high:  # true for NaN
             raise PacketError(f"{type(record).__name__}: {path} is {value}, not in {low:.7g}..{high:.7g}")
 

@@ -74,7 +74,9 @@ def pack_descriptors(descriptors: Codes) -> bytes:
     opposite = (likeness[np.arange(_BITS), like] < 0)[:, None]
     bits[1:] ^= bits[like[1:]] ^ opposite[1:]
     head = like.astype(np.uint8).tobytes() + np.packbits(opposite).tobytes()
-    return min(descriptors.tobytes(), _deflate(head + np.packbits(bits, axis=1).tobytes()), key=len)
+    deflater = zlib.compressobj(wbits=_RAW, strategy=zlib.Z_HUFFMAN_ONLY)  # bytes repeat by chance only
+    coded = deflater.compress(head + np.packbits(bits, axis=1).tobytes()) + deflater.flush()
+    return min(descriptors.tobytes(), coded, key=len)
 
 
 def unpack_descriptors(data: bytes, count: int) -> Codes:
