@@ -1,18 +1,19 @@
 """Map fusion to the letter of the paper (FC-SLAM, section III.C): rigid maps aligned by matched points.
 
 "When two valid matching points are obtained", their coordinates in both robots' own maps give the rotation and the
-translation between the two, eqs. (5) and (6). The paper does not say which two. Here two points are valid if they lie
-``APART_M`` or more apart and equally far in both maps, as maps are rigid, and if the rotation that they give is about
-that of the headings at either point. The two most similar such matches count. No other closure is asked and nothing is
-optimized: two false matches that fit each other turn a whole map, and the drift within the robots' maps stays. It is
-here to be compared with the joint graph.
+translation between the two, eqs. (5) and (6). The paper says neither which two, nor what becomes of further points.
+Here two points are valid if they lie ``APART_M`` or more apart and equally far in both maps, as maps are rigid, and if
+the rotation that they give is about that of the headings at either point. The two most similar such matches count.
+Matches that agree with their rotation and translation then count as much, by least squares: the two points alone are
+off by as much as the robots stood apart. No other closure is asked: two false matches that fit each other turn a whole
+map, and the drift within the robots' maps stays. It is here to be compared with the joint graph.
 
 The paper takes the coordinates of the matching places themselves and so equates where the two robots stood. A verified
 closure is more precise: the matched point is the position of its keyscan j, and ``T_i_j`` gives it in the other map.
 Where words alone decide, no ``T_i_j`` is measured; it is zero, and the two positions are one as in the paper.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,7 @@ import numpy as np
 from fcslam.cloud.closure_log import ClosureEntry
 from fcslam.cloud.result import Fusion
 from fcslam.geometry import se2
-from fcslam.geometry.alignment import two_point_alignment
+from fcslam.geometry.alignment import n_point_alignment, two_point_alignment
 from fcslam.graph.evidence import DISTINCT_RAD
 from fcslam.records import ClosureStatus, FloatArray, LoopClosure, Reason, ReasonCode, frozen
 
@@ -47,10 +48,7 @@ def fuse_rigidly(closures: Iterable[ClosureEntry], T_local_base: Mapping[str, Fl
     maps, frames = [[robot] for robot in T_local_base], {robot: np.zeros(3) for robot in T_local_base}
     used: dict[ClosureEntry, Reason] = {}
     for robots, members in _links(valid, T_local_base).items():
-        try:
-            T_a_b = two_point_alignment([poses[0, :2] for _, poses in members], [poses[1, :2] for _, poses in members])
-        except ValueError:  # a robot claims to be so far away that its two points are one to a computer
-            continue
+        T_a_b = n_point_alignment(*np.stack([poses[:, :2] for _, poses in members], axis=1))
         if np.isfinite(T_a_b).all() and _join(robots, T_a_b, maps, frames):
             used |= {entry: Reason(ReasonCode.MATCHED_POINT, len(members)) for entry, _ in members}
     T_map_base: dict[str, FloatArray] = {
@@ -61,8 +59,8 @@ def fuse_rigidly(closures: Iterable[ClosureEntry], T_local_base: Mapping[str, Fl
 
 def _links(
     entries: Iterable[ClosureEntry], T_local_base: Mapping[str, FloatArray]
-) -> dict[tuple[str, str], tuple[_Match, _Match]]:
-    """The two matches that align the maps of each pair of robots; pairs with the most similar ones come first."""
+) -> dict[tuple[str, str], list[_Match]]:
+    """The matches that align the maps of each pair of robots; pairs with the two most similar ones come first."""
     order = list(T_local_base)
     known: dict[tuple[str, str], list[_Match]] = {}
     two: dict[tuple[str, str], tuple[_Match, _Match]] = {}
@@ -78,7 +76,19 @@ def _links(
         if partner is not None and robots not in two:
             two[robots] = partner, (entry, poses)
         earlier.append((entry, poses))
-    return two
+    return {robots: _agreeing(known[robots], points) for robots, points in two.items()}
+
+
+def _agreeing(matches: Sequence[_Match], two: tuple[_Match, _Match]) -> list[_Match]:
+    """The matches that the alignment of two of them lays on each other; these two may each be off by ``EQUAL_M``."""
+    try:
+        T_a_b = two_point_alignment(*np.stack([poses[:, :2] for _, poses in two], axis=1))
+    except ValueError:  # a robot claims to be so far away that its two points are one to a computer
+        return list(two)
+    poses = np.stack([poses for _, poses in matches])
+    off = se2.between(poses[:, 0], se2.compose(T_a_b, poses[:, 1]))
+    agree = (np.hypot(off[:, 0], off[:, 1]) <= 2.0 * EQUAL_M) & (np.abs(off[:, 2]) < DISTINCT_RAD)
+    return [match for match, fits in zip(matches, agree, strict=True) if fits]
 
 
 def _are_valid(poses: FloatArray, others: FloatArray) -> bool:

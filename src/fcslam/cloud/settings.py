@@ -19,7 +19,7 @@ class FusionStrategy(StrEnum):
     JOINT = "joint"
     """All robots in one robust pose graph, every closure decided by all evidence."""
     TWO_POINT = "two_point"
-    """Rigid maps, each pair aligned by its two most similar matched points: the paper's eqs. (5)-(6)."""
+    """Rigid maps, aligned by their two most similar matched points (eqs. (5)-(6) of the paper) and what agrees."""
 
 
 class FleetConfig(Settings):
