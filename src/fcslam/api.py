@@ -144,12 +144,15 @@ def localize(
         force: as for ``map_recordings``.
         progress: called every 50 scans.
         floor: floor of the recording, whose first map is used; it must be named if the run has maps of several floors.
-        update: draw what changed since into the map of the run, where at least ``map.contradicting_scans`` scans show
-            it. The map before is beside it, as ``map_before``; poses and unchanged cells stay.
+        update: change the map of the run where at least ``map.contradicting_scans`` scans contradict it. The previous
+            map is beside it, as ``map_before``; poses and other cells stay.
 
     Returns:
-        A run whose trajectory holds the poses that the robot believed; ``localized`` has every scan with standard
-            deviations and quality.
+        A run whose trajectory has the localized scans; ``localized`` has every scan with standard deviations and
+            quality.
+
+    Raises:
+        InputError: the recording, the map, the pose, the floor, the configuration or the output folder cannot be used.
     """
     from fcslam.mission.localization import (  # SciPy's images: mapping alone needs none
         FinishedMap,
@@ -196,6 +199,9 @@ def changes(
         map_index: number of the map in the run folder.
         output: folder to write; by default nothing is written.
         force: replace changes that are at ``output``.
+
+    Raises:
+        InputError: the run has no mission file or no such map, a time is wrong, or the output folder cannot be used.
     """
     from fcslam.mission.map_changes import changes_of, check_output, save_changes
 

@@ -107,7 +107,7 @@ def read_arrays(path: Path) -> Arrays:
         except OSError:
             raise
         except Exception as error:  # the archive, its compressions and NumPy have errors of their own
-            raise ValueError(f"no archive of arrays: {error}") from error
+            raise ValueError(f"not an archive of arrays: {error}") from error
 
 
 def open_unpacked(path: Path) -> BinaryIO:

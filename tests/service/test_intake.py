@@ -193,7 +193,7 @@ def test_bytes_that_are_no_batch_change_nothing(desk):
 def test_a_second_agent_waits_until_the_first_is_silent_long_enough(desk):
     desk.take(DATA[0], agent="x")
     desk.take(robot="b", agent="y")  # another robot is another matter
-    with pytest.raises(InputError, match="another agent"):
+    with pytest.raises(InputError, match="another process"):
         desk.take(DATA[1], agent="y")
     desk.now += AGENT_LEASE_S - 1.0
     desk.take(DATA[1], agent="x")

@@ -37,7 +37,7 @@ FuseMembers = Callable[[Sequence[MappedRobot]], OccupancyMap]
 
 @dataclass(frozen=True, slots=True)
 class Anchors:
-    """What is known about the building."""
+    """What is known about the building; ``read_anchors`` makes it."""
 
     plan: "BuildingPlan | None" = None
     survey: "Survey | None" = None
@@ -51,6 +51,9 @@ def read_anchors(plan: StrPath | None = None, plan_scale: float | None = None, t
         plan: floor plan: a PNG drawing, a DXF drawing, or the YAML file of a ROS map.
         plan_scale: metres per pixel of a drawing; metres per unit of a DXF file that does not name its unit.
         tags: YAML file with the positions of surveyed tags.
+
+    Raises:
+        InputError: a file cannot be read, or the scale is missing or wrong.
     """
     if plan is None and plan_scale is not None:
         raise InputError(

@@ -66,7 +66,7 @@ def list_edits(mission: Mission) -> None:
 
 
 @app.command()
-def undo(mission: Mission, number: Annotated[int, typer.Argument(min=1, help="Of the edit.")]) -> None:
+def undo(mission: Mission, number: Annotated[int, typer.Argument(min=1, help="Number in `fcslam edit list`.")]) -> None:
     """Undo an edit. The map is then as if the edit had never been made."""
     from fcslam.records import Undo
 

@@ -57,7 +57,7 @@ def check_tls(certificate: Path | None, key: Path | None, client_ca: Path | None
     try:
         context.load_cert_chain(certificate, key, no_passphrase)
     except (OSError, ssl.SSLError) as error:
-        raise InputError(f"{certificate}, {key}: no certificate with its key ({error})") from error
+        raise InputError(f"{certificate}, {key}: not a certificate with its key ({error})") from error
     if client_ca is None:
         return
     try:

@@ -80,7 +80,7 @@ def localize(
 ) -> None:
     """Find a robot in a finished map and follow it. The map does not change.
 
-    The run folder holds the poses that the robot believed, and for every scan its standard deviations and quality.
+    The run folder has the poses of all localized scans, and for every scan its standard deviations and quality.
     """
     from fcslam.api import localize as localize_recording
     from fcslam.cli.progress import ProgressDisplay

@@ -34,13 +34,13 @@ def _as_list(corners: object) -> object:
     try:
         return json.loads(corners) if isinstance(corners, str) else corners
     except ValueError as error:
-        raise ValueError(f"no polygon: {HOW_TO_GIVE}") from error
+        raise ValueError(f"not a polygon: {HOW_TO_GIVE}") from error
 
 
 def _is_polygon(corners: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
     twice_area = sum(x1 * y2 - x2 * y1 for (x1, y1), (x2, y2) in _sides(corners))
     if corners and abs(twice_area) < 2.0 * LEAST_AREA_M2:  # also of fewer than three corners
-        raise ValueError(f"no polygon, as it has no inside: {HOW_TO_GIVE}")
+        raise ValueError(f"not a polygon, because it has no area: {HOW_TO_GIVE}")
     return corners
 
 

@@ -112,10 +112,9 @@ class LocalizedRobot(LiveTracker):
             self._stack = stack.pop_all()
 
     def suggest_pose(self, pose: ArrayLike) -> None:
-        """Say about where the robot is now, as by hand. Any thread may call this.
+        """Suggest an approximate pose of the robot now. Any thread may call this.
 
-        The pose counts once the walls around the robot confirm it; until then nothing changes, and after 15 m of travel
-        it is forgotten.
+        The robot uses the pose once the walls around it confirm it, and drops it after 15 m of travel without that.
 
         Args:
             pose: (x, y, theta) of ``base`` in the map, metres and radians.

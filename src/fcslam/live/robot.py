@@ -178,8 +178,10 @@ class Robot(LiveTracker):
         Args:
             image: undistorted, shape (height, width), or (height, width, 3) in the order red, green, blue; uint8.
             stamp: seconds, as in ``add_scan``.
-            odometry: as in ``add_scan``, at the stamp of the image. None: the robot is taken to be where the last scan
-                was made.
+            odometry: as in ``add_scan``, at the stamp of the image. None: the pose is that of the last scan.
+
+        Raises:
+            InputError: the robot has no camera, or the image, the stamp or the odometry cannot be used.
         """
         if self._camera is None:
             raise InputError(f"{self.name}: the robot has no camera; give camera=fcslam.CameraModel(...)")
@@ -189,9 +191,10 @@ class Robot(LiveTracker):
             self.add(checked_image(image, stamp, T_odom_base, self._camera))
 
     def change_floor(self, floor: str) -> None:
-        """Go on in a new session on another floor: after a ride in a lift, before the first scan there.
+        """Begin a new session on another floor; call it after a ride in a lift, before the first scan there.
 
-        ``floor`` is as for the robot itself.
+        Args:
+            floor: name of the floor, 1 to 16 letters, digits and ``. _ + -``.
         """
         _check_floor(floor)
         with self._lock:

@@ -30,7 +30,7 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
         None; or why the cloud cannot be reached, if ``folder`` holds an earlier copy, which then stays as it is.
     """
     if (folder / MISSION).exists():
-        raise InputError(f"{folder}: is a run, no copy of the maps of a cloud; give another folder")
+        raise InputError(f"{folder}: is a run folder, not a copy of a cloud's maps; give another folder")
     prepare_output(folder, force=True)
     troubles = []
     for address in addresses(server.url):

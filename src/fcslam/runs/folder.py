@@ -77,7 +77,7 @@ class Run(RunTables):
     local_maps: Mapping[str, LocalMap] = field(default_factory=dict)
     """By robot: every robot's own map. Live results of the service have none, and their folder has no ``local``."""
     quality: bytes = b""
-    """Content of quality.json: how good the maps are where; empty: not computed."""
+    """Content of quality.json, the certificate of each map; empty: not computed."""
     mission: bytes = b""
     """The mission file: packets and edits, with which the mission can go on. Live results of the service have none."""
     localized: Mapping[str, LocalizedPoses] = field(default_factory=dict)
@@ -95,7 +95,8 @@ class Run(RunTables):
 
     @cached_property
     def verdict(self) -> tuple[MapVerdict, ...]:
-        """Whether to use each map, and why. Decided at the first use."""
+        """The verdict on each map, in the order of their numbers: ``str`` of one gives its sentence. Computed at the
+        first use."""
         return verdicts(self, self.quality)
 
     def save(self, folder: StrPath, force: bool = False) -> None:
@@ -104,6 +105,9 @@ class Run(RunTables):
         Args:
             folder: the folder to make; its parents are made too.
             force: replace a run that is there.
+
+        Raises:
+            InputError: the folder exists without ``force``, or cannot be written.
         """
         check_names([*self.trajectories, *self.local_maps, *self.map_files])
         place = prepare_output(Path(folder), force)
@@ -164,6 +168,9 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
     Args:
         folder: the run folder.
         maps: read the maps, the pose graph and the mission file too, which may be large.
+
+    Raises:
+        InputError: the folder is missing, damaged, or not a run folder.
     """
     path = Path(folder)
     if not path.exists():

@@ -42,7 +42,7 @@ class RobotTrajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalizedPoses:
-    """Where a robot believed to be in a finished map, at every laser scan of its recording."""
+    """Poses of one robot in a finished map, at every laser scan of its recording."""
 
     robot: str
     stamps: FloatArray
@@ -60,11 +60,11 @@ class LocalizedPoses:
 
     @property
     def is_localized(self) -> NDArray[np.bool_]:
-        """Whether the robot knew where it was, shape (N,)."""
+        """Whether the robot had a pose, shape (N,)."""
         return ~np.isnan(self.T_map_base[:, 0])
 
     def believed(self) -> RobotTrajectory:
-        """The poses that the robot believed, in map 0."""
+        """The scans at which the robot had a pose, in map 0."""
         known = self.is_localized
         in_space: FloatArray | None = None if self.T_map_base_6d is None else frozen(self.T_map_base_6d[known])
         stamps: FloatArray = frozen(self.stamps[known])

@@ -110,7 +110,7 @@ class Agents:
 def held_by_another(robot: str, wait_s: float) -> InputError:
     """Another agent speaks for a robot, for so long at most if it is gone."""
     return InputError(
-        f"{robot}: another agent speaks for this robot; stop one of the two or name it differently, "
+        f"{robot}: another process sends as this robot; stop one of the two or name it differently, "
         f"or wait {wait_s:.0f} s if it is gone"
     )
 

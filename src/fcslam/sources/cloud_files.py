@@ -113,7 +113,7 @@ def read_cloud(path: Path, stamp: float) -> PointCloud:
         values = {".bin": _kitti, ".pcd": _pcd, ".ply": _ply}[path.suffix](content)
         points = np.stack([np.asarray(values[axis], np.float64) for axis in "xyz"], axis=1)
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise SourceError(f"{path}: is not a cloud that can be read ({error}); write it anew") from error
+        raise SourceError(f"{path}: is not a cloud that can be read ({error}); write it again") from error
     measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
     cloud = PointCloud(stamp, "", points[measured], np.empty(0))
     name = next((name for name in TIMES if name in values), None)
@@ -157,7 +157,7 @@ def _ply(content: bytes) -> dict[str, Any]:
     begin = content.index(b"\n", end) + 1
     elements = [words for words in lines if words[:1] == ["element"]]
     if lines[0] != ["ply"] or elements[0][1] != "vertex":
-        raise ValueError("no vertices come first")
+        raise ValueError("its first element is not `vertex`")
     after = lines.index(elements[0]) + 1
     until = lines.index(elements[1]) if len(elements) > 1 else len(lines)
     properties = [words for words in lines[after:until] if words[:1] == ["property"]]

@@ -250,7 +250,7 @@ def test_another_agent_is_refused_by_every_instance(registry, postgres):
     here, there = (SharedAgents(postgres, number, lambda: now[0]) for _ in range(2))
     here.hold("a", "x")
     there.hold("b", "y")
-    with pytest.raises(InputError, match="another agent speaks for this robot"):
+    with pytest.raises(InputError, match="another process sends as this robot"):
         there.hold("a", "z")
     there.hold("a", "x")  # a robot may change the instance
     now[0] += AGENT_LEASE_S
@@ -259,7 +259,7 @@ def test_another_agent_is_refused_by_every_instance(registry, postgres):
     assert there.silent_s("c") is None
     here.end("a")
     there.hold("a", "z")
-    with pytest.raises(InputError, match="another agent speaks for this robot"):
+    with pytest.raises(InputError, match="another process sends as this robot"):
         here.hold("a", "x")
 
 

@@ -35,7 +35,7 @@ Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M, allow_inf_nan
 def _number(value: object) -> object:
     """JSON knows 1.0 as an integer, and true as none."""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError("is no number")
+        raise ValueError("is not a number")
     return value
 
 

@@ -56,7 +56,7 @@ def _encoded_png(content: Any) -> bytes:
     if channels is None:
         raise ValueError("an encoding that is not read")
     if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and step >= width * channels):
-        raise ValueError("no sane size")
+        raise ValueError("invalid width or height")
     data = np.asarray(content.data, dtype=np.uint8)
     if len(data) != step * height:
         raise ValueError("the pixels do not fill the image")

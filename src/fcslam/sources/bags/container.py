@@ -89,7 +89,7 @@ class BagPart:
         self._remedy = next((_REMEDIES[magic] for magic in _REMEDIES if head.startswith(magic)), "")
         if not self._remedy:
             raise SourceError(
-                f"{path}: no bag, or a compressed one; unpack it first, as by `gunzip`, `xz -d` or `zstd -d`"
+                f"{path}: not a bag, or a compressed one; unpack it first by `gunzip`, `xz -d` or `zstd -d`"
             )
         self.file: RecordFile | DatabaseFile = (
             DatabaseFile(path) if head == SQLITE_MAGIC else RecordFile(path, head.startswith(ROS1_MAGIC))

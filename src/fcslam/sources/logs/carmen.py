@@ -90,7 +90,7 @@ class CarmenArrays:
                 try:
                     message = _MESSAGE.match(line)
                     if message is None:
-                        raise ValueError("no CARMEN message")
+                        raise ValueError("not a CARMEN message")
                     parse = parsers.get(message[1])
                     content = parse(line.replace(b",", b".")) if parse else None  # some languages write decimal commas
                 except ValueError:
@@ -125,7 +125,7 @@ class CarmenArrays:
         _, _, *text = front.split(None, 2)
         values, rest = numbers_in(b"".join(text), int(count))
         if rest.strip():
-            raise ValueError("not as many ranges as stated")
+            raise ValueError("number of ranges differs from the stated one")
         return self._scan(None, tail, values)
 
     def _robotlaser(self, line: bytes) -> int:
@@ -149,7 +149,7 @@ class CarmenArrays:
     ) -> int:
         """Add a scan; the log states no ``stamp`` if it is None."""
         if len(ranges_m) == 0:
-            raise ValueError("not as many ranges as stated")
+            raise ValueError("number of ranges differs from the stated one")
         self._poses.extend(_pose_of(poses[:3]) + _pose_of(poses[3:]))
         scan = len(self.stamps)
         if not (ranges_m.min() >= 0.0 and ranges_m.max() < _LONGEST_RANGE_M):
@@ -184,7 +184,7 @@ def _measured(front: bytes) -> tuple[FloatArray, LaserModel]:
     values, rest = numbers_in(text, int(count))
     remission_count, *remissions = rest.split()
     if len(remissions) != int(remission_count):
-        raise ValueError("not as many remissions as stated")
+        raise ValueError("number of remissions differs from the stated one")
     numbers = [float(token) for token in (start, fov, resolution, max_range)]
     return values, _stated_laser(int(kind), numbers, len(values))
 
@@ -231,7 +231,7 @@ def _stated_laser(kind: int, numbers: list[float], beam_count: int) -> LaserMode
     start_rad, fov_rad, resolution_rad, max_range_m = numbers
     increment_rad = resolution_rad if resolution_rad > 0.0 else fov_rad / (beam_count - 1)
     if not (increment_rad > 0.0 and is_field_of_view(Beams(beam_count, start_rad, increment_rad))):
-        raise ValueError("no sane field of view")
+        raise ValueError("invalid field of view")
     if not 0.0 < max_range_m < float("inf"):
         max_range_m = SICK_MAX_RANGE_M
     if kind in SICK_TYPES:
@@ -244,7 +244,7 @@ def _pose_of(tokens: Sequence[bytes | float]) -> Pose:
     x, y, theta = map(float, tokens)
     limit = LARGEST_COORDINATE
     if not (-limit < x < limit and -limit < y < limit and -limit < theta < limit):
-        raise ValueError("no sane pose")
+        raise ValueError("invalid pose")
     return x, y, theta
 
 
@@ -252,5 +252,5 @@ def _stamp_of(token: bytes) -> float:
     """Raises ValueError if it is not finite."""
     stamp = float(token)
     if not isfinite(stamp):
-        raise ValueError("no finite stamp")
+        raise ValueError("invalid stamp")
     return stamp
