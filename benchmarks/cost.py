@@ -138,7 +138,7 @@ def map_building(driven: list[Driven], config: MissionConfig) -> Spent:
     applied = time.process_time()
     tracks = dict(itertools.chain(*(robot.tracks.items() for robot in driven)))
     hours = sum(robot.hours for robot in driven)
-    run = cloud.run(tracks, sum(robot.scans for robot in driven), 3600.0 * hours)
+    run = cloud.run(tracks, sum(robot.scans for robot in driven))
     ended = time.process_time()
     sent = sum(len(sized.data) for robot in driven for sized in robot.packets)
     area_m2 = sum(np.isin(grid.cells, KNOWN).sum() * grid.resolution_m**2 for grid in run.maps.values())

@@ -80,9 +80,9 @@ class OwnMap:
         """Both ends of each accepted closure in the map that a session is in, shape (N, 2, 2), metres in ``map``."""
         return self._answer(_call_host, FleetHost.closures, session, T_map_own)
 
-    def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
+    def run(self, tracks: Mapping[str, Track], scans: int) -> Run:
         """The result of all packets so far; arguments as in ``MissionCloud.run``."""
-        return self._answer(MissionCloud.run, tracks, scans, recorded_s)
+        return self._answer(MissionCloud.run, tracks, scans)
 
     def _forget_applied(self) -> None:
         while self._applying and self._applying[0].done():

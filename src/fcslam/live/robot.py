@@ -388,7 +388,7 @@ class Robot(LiveTracker):
         if not tracks:
             raise InputError(f"{self.name}: no scan was added, so there is no map to save")
         stamps = np.concatenate([track.stamps for track in tracks.values()])
-        run = own.run(tracks, len(stamps), float(np.ptp(stamps)))
+        run = own.run(tracks, len(stamps))
         run.save(folder, force)
         return run
 

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 from pydantic import Field
 
 from fcslam.anchoring.anchors import Anchored, Anchors, anchored
@@ -129,7 +130,7 @@ def run_mission(
             cloud.apply(sent)
             live(cloud)
     meter.report(fusing=True)
-    return cloud.run(meter.tracks, meter.scans, meter.recorded_s)
+    return cloud.run(meter.tracks, meter.scans)
 
 
 class MissionCloud:
@@ -160,13 +161,12 @@ class MissionCloud:
             self._traffic.accept(packet.label, len(packet.data))
         return replies
 
-    def run(self, tracks: Mapping[str, Track], scans: int, recorded_s: float) -> Run:
+    def run(self, tracks: Mapping[str, Track], scans: int) -> Run:
         """The result of all packets so far.
 
         Args:
             tracks: the scans of the sessions, in their order. Other sessions come first, with their keyscans alone.
             scans: number of scans.
-            recorded_s: length of the recordings together, seconds.
         """
         trim_memory()  # the robots have ended, and each step below needs much for a moment
         result = self.host.finalize()
@@ -174,6 +174,7 @@ class MissionCloud:
         unknown = {robot.robot: keyscan_track(robot) for robot in result.robots if robot.robot not in tracks}
         mapped = {robot.robot for robot in result.robots}
         tracks = unknown | {name: track for name, track in tracks.items() if name in mapped}
+        recorded_s = sum(float(np.ptp(track.stamps)) for track in tracks.values() if len(track.stamps))
         counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
         metrics = (*counts, *traffic_metrics(self._traffic, tracks))
         mission = mission_bytes(self.config.cloud, self.host.edits, self._packets, self._refused, tracks)
@@ -217,12 +218,12 @@ class _Meter:
 
     @property
     def recorded_s(self) -> float:
-        """Time between the first and the last scan, of all robots together."""
+        """Time between the first and the last scan of each recording, together."""
         return sum(last - first for first, last in self._span.values())
 
     def count(self, leg: Leg) -> None:
         """One more leg of a robot."""
-        if leg.stamps:
+        if leg.stamps and (leg.robot in self._span or not leg.tracks):  # what was recorded before comes as one leg
             first, last = self._span.get(leg.robot, (leg.stamps[0], leg.stamps[0]))
             self._span[leg.robot] = min(first, *leg.stamps), max(last, *leg.stamps)
         self.scans += len(leg.stamps)

@@ -23,9 +23,10 @@ class SealedConnection(sqlite3.Connection):
 
     def insert(self, table: StoreTable, rows: Iterable[Sequence[object]], *, replaces: bool = False) -> None:
         """As in ``Transaction``. The seal is of the values as they are read again."""
-        marks = ", ".join(f"?{number}" for number in range(1, len(table.columns) + 1))
+        marks = ", ".join("?" * len(table.columns))  # Python 3.12.1 takes ?1 for a name
         verb = "INSERT OR REPLACE" if replaces else "INSERT"
-        self.executemany(f"{verb} INTO {table.name} VALUES ({marks}, seal('{table.name}', {marks}))", rows)
+        sealed = f"{verb} INTO {table.name} VALUES ({marks}, seal('{table.name}', {marks}))"
+        self.executemany(sealed, ((*row, *row) for row in rows))
 
     def stream(self, table: StoreTable) -> Iterator[tuple[Any, ...]]:
         """As in ``Transaction``."""
