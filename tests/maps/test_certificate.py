@@ -106,6 +106,13 @@ def test_errors_are_larger_where_scans_do_not_see_whether_the_wheels_slip():
     assert covariances(graph, [path(poses)]).scale == pytest.approx(np.hypot(QUIET, UNSEEN))
 
 
+def test_a_map_that_an_exact_plan_bent_is_as_good_as_before():
+    graph, poses = chain(closures=[(i, i + 5) for i in range(30)])
+    bent = poses * (1.02, 1.0, 1.0)
+    before, after = covariances(graph, [path(poses)]), covariances(PoseGraph(bent, graph.edges), [path(bent)], graph)
+    assert after.bend_m(10.0).mean() == pytest.approx(before.bend_m(10.0).mean(), rel=0.05)
+
+
 def bend_of(poses, truth, within_m):
     """Root mean square error of the positions around each pose, after the best rigid alignment."""
     errors = []

@@ -15,6 +15,7 @@ from fcslam.cloud.sessions import robot_of
 from fcslam.geometry.groups import SE2, group_of
 from fcslam.graph.evidence import ClusterEvidence
 from fcslam.graph.g2o import g2o_text
+from fcslam.graph.pose_graph import PoseGraph
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.drawing import picture
 from fcslam.maps.fusion import fuse
@@ -69,8 +70,12 @@ def run_of(
     *,
     with_local_maps: bool = True,
     with_certificates: bool = True,
+    measured: PoseGraph | None = None,
 ) -> Run:
-    """Collect the contents of a run folder; ``tracks`` holds every robot of the result and gives their order."""
+    """Collect the contents of a run folder; ``tracks`` holds every robot of the result and gives their order.
+
+    ``measured`` is the graph before anchors bent it.
+    """
     mapped = {robot.robot: robot for robot in result.robots}
     trajectories = {
         name: RobotTrajectory(
@@ -84,7 +89,7 @@ def run_of(
         for name, track in tracks.items()
     }
     fused = dict(fused_maps(result, grid))
-    certificates = _certificates(result, fused, grid.robot_radius_m) if with_certificates else {}
+    certificates = _certificates(result, fused, grid.robot_radius_m, measured) if with_certificates else {}
     trim_memory()  # dense covariances and pictures are large, and need not be there at the same time
     map_files = _map_files(result, trajectories, fused) | _space_files(result)
     trim_memory()
@@ -221,7 +226,7 @@ def _space_files(result: FleetResult) -> dict[str, bytes]:
 
 
 def _certificates(
-    result: FleetResult, maps: Mapping[int, OccupancyMap], robot_radius_m: float
+    result: FleetResult, maps: Mapping[int, OccupancyMap], robot_radius_m: float, measured: PoseGraph | None
 ) -> dict[int, dict[str, Any]]:
     from fcslam.maps.certificate import MappedPath, certify  # a live robot has no use for it, and SciPy is large
 
@@ -230,7 +235,7 @@ def _certificates(
         members = [robot for robot in result.robots if robot.map_index == k and len(robot.stamps)]
         if members and fused.cells.any() and (k == 0 or sum(len(robot.stamps) for robot in members) >= LEAST_DRAWN):
             paths = [MappedPath(robot.T_map_base, robot.variables) for robot in members]
-            certificates[k] = certify(result.graph, paths, fused, robot_radius_m=robot_radius_m)
+            certificates[k] = certify(result.graph, paths, fused, None, robot_radius_m, measured)
     return certificates
 
 

@@ -99,14 +99,16 @@ def certify(
     occupancy: OccupancyMap,
     bar_m: float | None = None,
     robot_radius_m: float = 0.0,
+    measured: PoseGraph | None = None,
 ) -> dict[str, Any]:
     """The certificate of one map, as ``quality.json`` has it; lengths in metres.
 
     ``paths`` are the sessions of the map, at least one keyscan in all; the first one begins its frame. A cell is good
     if the bound of the error within ``WITHIN_M`` around it is at most ``bar_m``, by default a cell of the map.
+    ``measured`` is the graph before a plan or surveyed tags bent it, whose residuals are those of the measurements.
     """
     bar_m = occupancy.resolution_m if bar_m is None else bar_m
-    places = covariances(graph, paths)
+    places = covariances(graph, paths, measured)
     centres = _known_squares(occupancy)
     nearest = np.array([np.argmin(_distances(places.poses, centre)) for centre in centres], np.int64)
     bound = QUANTILE * places.bend_m(WITHIN_M)
@@ -132,7 +134,7 @@ def certify(
     }
 
 
-def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
+def covariances(graph: PoseGraph, paths: Sequence[MappedPath], measured: PoseGraph | None = None) -> Places:
     """A sample of the keyscans of one map with the covariance of their errors; the first keyscan has none."""
     poses = np.concatenate([path.T_map_base for path in paths])
     variables = np.concatenate([path.variables for path in paths])
@@ -146,7 +148,8 @@ def covariances(graph: PoseGraph, paths: Sequence[MappedPath]) -> Places:
     turn = se2.adjoint(poses[chosen] * (0.0, 0.0, 1.0))
     covariance = np.einsum("pab,pbqc,qdc->paqd", turn, in_bases, turn, optimize=True).reshape(3 * len(chosen), -1)
     drift, unseen = _path_near(part, poses, chosen)
-    scale = np.sqrt(QUIET**2 + _contradiction(graph, rows, poses, chosen) ** 2 + (UNSEEN * unseen) ** 2)
+    contradiction = _contradiction(measured or graph, rows, poses, chosen)
+    scale = np.sqrt(QUIET**2 + contradiction**2 + (UNSEEN * unseen) ** 2)
     return Places(variables[chosen], poses[chosen], covariance, scale, drift)
 
 

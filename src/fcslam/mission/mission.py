@@ -179,7 +179,7 @@ class MissionCloud:
         metrics = (*counts, *traffic_metrics(self._traffic, tracks))
         mission = mission_bytes(self.config.cloud, self.host.edits, self._packets, self._refused, tracks)
         placing = self._placed(result)
-        run = run_of(placing.result, tracks, metrics, dump(self.config), self.config.map)
+        run = run_of(placing.result, tracks, metrics, dump(self.config), self.config.map, measured=result.graph)
         run = replace(run, map_files={**run.map_files, **placing.files})
         return replace(run, mission=mission)
 
