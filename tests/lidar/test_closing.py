@@ -77,6 +77,16 @@ def test_closures_that_agree_with_one_but_not_with_each_other_do_not_support_it(
     assert supported(star, anchors[:, 0], anchors) == []
 
 
+def test_two_closures_are_consistent_with_each_other_or_neither_is():
+    """A loop that ends 1 m off with a turn of 0.2 rad ends elsewhere if it is driven the other way round."""
+    rng = np.random.default_rng(1)
+    scattered = [closure(k, 10 + k, se2.compose(rng.normal(0.0, (0.5, 0.5, 0.1)), RETURN)) for k in range(10)]
+    consistent = consistency(scattered, TRAVEL, ANCHORS)
+    assert not consistent.all()
+    assert (consistent == consistent.T).all()
+    supported(scattered, TRAVEL, ANCHORS)
+
+
 CORRIDOR_M = 50.0
 SHORT_LASER = LaserModel(360, -np.pi, np.deg2rad(1.0), 12.0)
 

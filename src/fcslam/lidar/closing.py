@@ -316,7 +316,7 @@ def supported(pending: Sequence[LocalClosure], travel: FloatArray, anchors: Floa
 def consistency(closures: Sequence[LocalClosure], travel: FloatArray, anchors: FloatArray) -> NDArray[np.bool_]:
     """Whether the loop over two closures and the estimated motions between their ends closes, shape (C, C).
 
-    It must close within the drift allowed for on the path in it.
+    It must close within the drift allowed for on the path in it, whichever of the two it is driven from.
 
     Arguments as for ``supported``.
     """
@@ -330,7 +330,8 @@ def consistency(closures: Sequence[LocalClosure], travel: FloatArray, anchors: F
     between_later_m = np.abs(np.subtract.outer(travel[ends[:, 1]], travel[ends[:, 1]]))
     path_m = between_later_m + np.hypot(earlier[..., 0], earlier[..., 1])
     off = np.stack((np.hypot(residual[..., 0], residual[..., 1]), np.abs(residual[..., 2])), axis=-1)
-    return np.asarray((off < drift_allowance(path_m)).all(axis=-1))
+    closes = (off < drift_allowance(path_m)).all(axis=-1)
+    return np.asarray(closes & closes.T)
 
 
 @njit
