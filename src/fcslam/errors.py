@@ -69,7 +69,7 @@ class UnavailableError(FcslamError):
 
 
 class StoreError(InputError):
-    """A mission cannot be stored or read: a full disk, a damaged file, a file that is no mission, a database away."""
+    """A mission cannot be stored or read: a full disk, a damaged or foreign file, an unreachable database."""
 
     def __init__(self, message: str, is_away: bool = False) -> None:
         super().__init__(message)

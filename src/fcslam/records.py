@@ -186,7 +186,7 @@ class LaserScan:
     new_floor: str = ""
     """Floor that the robot is on from this scan on, which a new session maps; empty: none is named."""
     gyro: FloatArray | None = None
-    """Readings of a gyro since the scan before, shape (K, 2): stamp, and angular velocity about the vertical. None:
+    """Readings of a gyro since the previous scan, shape (K, 2): stamp, and angular velocity about the vertical. None:
     there is no gyro, or wheels measure the motion."""
 
     @property

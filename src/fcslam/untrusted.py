@@ -61,7 +61,7 @@ def open_file(path: Path, within: Path | None = None, most: int | None = None) -
         most: the largest size, bytes; None: any.
 
     Raises:
-        OSError: the file cannot be opened, is no regular file, or is a link within the folder; too large: LimitError.
+        OSError: the file cannot be opened, is not regular, or is a link within the folder; too large: LimitError.
     """
     descriptor = os.open(path, _FLAGS) if within is None else _open_within(path, within)
     try:

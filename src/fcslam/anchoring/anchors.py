@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
 TAGS_JSON = "tags.json"
 FIRST_LEVEL = "L1"
-"""Of a map whose floor has no name."""
+"""Level of a map whose floor has no name."""
 ONLY_SCANS, ONLY_PLAN = "only in the scans", "only in the plan"
 
 FuseMembers = Callable[[Sequence[MappedRobot]], OccupancyMap]

@@ -50,7 +50,7 @@ class PlanFit(NamedTuple):
     part: MapPart
     """With ranges in the scale of the plan."""
     scales: dict[str, float]
-    """Of each robot's lengths."""
+    """Scale of each robot's lengths."""
     residuals: tuple[float, float]
     """Root mean square residual of the scans, in standard deviations: as the map was, and bent to the plan."""
     compared: tuple[Comparison, Comparison]

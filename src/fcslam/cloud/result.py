@@ -88,7 +88,7 @@ class FleetResult:
     joins: Mapping[frozenset[str], ClusterEvidence] = field(default_factory=dict)
     """On what evidence two robots share a map, where closures between them agree."""
     sightings: tuple[TagSighting, ...] = ()
-    """Of the tags that the robots saw."""
+    """Sightings of the tags that the robots saw."""
     space_graph: PoseGraph | None = None
     """The pose graph in space."""
 

@@ -64,7 +64,7 @@ class _Session:
     spans: dict[tuple[int, Channel], tuple[int, int]] = field(default_factory=dict)
     """First and last keyscan behind the places at a keyscan, whichever detector described them."""
     fixes: dict[int, KeyscanFix] = field(default_factory=dict)
-    """Of satellite navigation, by keyscan."""
+    """Fixes of satellite navigation, by keyscan."""
     voxel_maps: dict[int, int] = field(default_factory=dict)
     """Numbers of the packets of voxel maps, by keyscan."""
 

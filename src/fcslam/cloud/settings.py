@@ -72,7 +72,7 @@ class FleetConfig(Settings):
 
     @property
     def group(self) -> Group:
-        """Of the poses."""
+        """Group of the poses: SE(2) or SE(3)."""
         return SE2 if self.dimensions == 2 else SE3
 
 

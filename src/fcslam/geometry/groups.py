@@ -65,7 +65,7 @@ class Group(NamedTuple):
         return self.log(self.between(T_i_j, self.between(x_i, x_j)))
 
     def jacobians(self, residual: _Array, x_i: _Array, x_j: _Array) -> tuple[_Array, _Array]:
-        """Of r, x_i and x_j: ``A`` and ``B``, shape (E, d, d); a step changes the residual by ``A d_i + B d_j``."""
+        """Jacobians ``A``, ``B`` by x_i and x_j, shape (E, d, d); a step changes the residual by ``A d_i + B d_j``."""
         of_j = self.log_jacobian(residual)
         return -of_j @ self.adjoint(self.between(x_j, x_i)), of_j
 

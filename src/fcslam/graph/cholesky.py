@@ -78,7 +78,7 @@ def marginal_covariance(
 ) -> FloatArray:
     """Marginal covariance of some variables, shape (W d, W d), where the edges measure with this information.
 
-    ``wanted``: the variables, shape (W,); those that are held have none. Other arguments as of ``solve``.
+    ``wanted``: the variables, shape (W,); those that are held have none. Other arguments as for ``solve``.
     """
     edges, height, size = jacobians[0].shape
     _, *factor = _factorized(structure, jacobians, information, np.zeros((edges, height)), held, 0.0)

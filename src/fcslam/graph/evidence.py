@@ -44,8 +44,8 @@ LEAD = 2.0
 """Least ratio of the closures of a cluster to those of the largest one that contradicts it, and least ``MapFit.ratio``
 of maps that fix the pose where no closure does."""
 FURTHER_PLACES = LEAD
-"""Further places that maps replace which fit so many times as well as elsewhere, and as well as those of one place do;
-and that a tag replaces, which both robots saw, if their maps do not contradict each other."""
+"""Further places that maps stand for if they fit twice as well as elsewhere and have a likeness of 1, and that a tag
+stands for if both robots saw it and their maps do not contradict each other."""
 
 
 class ConsistencySettings(Settings):

@@ -75,7 +75,7 @@ class _Problem(NamedTuple):
     T_i_j: FloatArray
     information: FloatArray
     scale: FloatArray
-    """Of each edge's information."""
+    """Scale of each edge's information."""
     start: FloatArray
     held: NDArray[np.bool_]
     """Variables that stay at ``start``."""

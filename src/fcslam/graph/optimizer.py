@@ -76,7 +76,7 @@ def optimize_gnc(
     ten times the time (``benchmarks/robust_graph.py``, m3500 with 100 random false loops). Neither is sure to find the
     best set: the drift of the odometry may favour a false loop.
 
-    ``initial`` is odometry or better. Arguments and result as of ``optimize``.
+    ``initial`` is odometry or better. Arguments and result as for ``optimize``.
     """
     steps = _Steps(graph, initial)
     _graduate(steps, steps.solve(np.ones_like(steps.chi2()), _FIRST_ITERATIONS))
@@ -93,7 +93,7 @@ def refine_inliers(
     The last part of ``optimize_gnc``, from closures that are trusted already: for graphs most of whose closures are
     false, where optimizing with all of them gives no useful start.
 
-    ``weights`` (E,): edges above one half are trusted at the start. Other arguments and result as of ``optimize``.
+    ``weights`` (E,): edges above one half are trusted at the start. Other arguments and result as for ``optimize``.
     """
     trusted = np.asarray(weights, dtype=np.float64)
     if trusted.shape != (graph.edge_count,):
@@ -102,7 +102,7 @@ def refine_inliers(
 
 
 class _Steps:
-    """Solves of one graph, each from the poses of the one before."""
+    """Solves of one graph, each from the poses of the previous one."""
 
     def __init__(self, graph: PoseGraph, initial: ArrayLike | None) -> None:
         self.poses = graph.poses() if initial is None else np.array(initial, dtype=np.float64)

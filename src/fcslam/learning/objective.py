@@ -30,17 +30,17 @@ class LossWeights:
     """Weights of the losses, each of which is a mean, and their parameters."""
 
     triplet: float = 1.0
-    """Of eq. (2)."""
+    """Weight of eq. (2)."""
     margin: float = 1.0
-    """Of eq. (2) at the end of training, to which it rises; 0 in the paper."""
+    """Margin of eq. (2) at the end of training, to which it rises; 0 in the paper."""
     rounding: float = 0.01
     """Added under the root of eq. (3); 0 in the paper."""
     contrastive: float = 1.0
-    """Of the InfoNCE loss of the descriptors before they become binary."""
+    """Weight of the InfoNCE loss of the descriptors before they become binary."""
     temperature: float = 0.05
-    """Of the InfoNCE loss, for similarities in [-1, 1]."""
+    """Temperature of the InfoNCE loss, for similarities in [-1, 1]."""
     distillation: float = 30.0
-    """Of a teacher's descriptors; falls to a quarter during training."""
+    """Weight of a teacher's descriptors; falls to a quarter during training."""
     balance: float = 0.1
     detector: float = 1.0
     agreement: float = 1.0
@@ -52,9 +52,9 @@ LOSSES: Final[dict[Losses, LossWeights]] = {
 }
 """By the setting."""
 KEYPOINTS_WEIGHT: Final = 100.0
-"""Of the loss that leaves keypoints where they are while the layers of the codes are trained."""
+"""Weight of the loss that keeps keypoints in place while the layers of the codes are trained."""
 REHEARSAL_WEIGHT: Final = 4.0
-"""Of the loss that keeps the codes of distorted views of a robot's images, so that less is forgotten."""
+"""Weight of the loss that keeps the codes of distorted views of a robot's images, so that less is forgotten."""
 
 
 class TeacherBits(NamedTuple):

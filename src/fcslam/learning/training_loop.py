@@ -132,7 +132,7 @@ class LocalTrainingPlan:
     """The steps of the whole run that are done now, and how."""
 
     settings: TrainingSettings
-    """Of the whole run; the learning rate falls towards the end of its steps."""
+    """Settings of the whole run; the learning rate falls towards the end of its steps."""
     first_step: int
     """Counted from 0 over the whole run."""
     steps: int
@@ -144,7 +144,7 @@ class LocalTrainingPlan:
 
     @property
     def numbers(self) -> range:
-        """Of the steps, over the whole run."""
+        """Numbers of the steps, over the whole run."""
         return range(self.first_step, self.first_step + self.steps)
 
 

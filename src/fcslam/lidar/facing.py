@@ -27,7 +27,7 @@ LONGEST_S: Final = 2.0 * calibration.LONGEST_S
 SCANS_WATCHED: Final = 60
 """Scans of a live laser that are compared."""
 MOST_COMPARED: Final = 50 * SCANS_WATCHED
-"""Scans of a recording that are read at most: most are too near to the one before."""
+"""Most scans of a recording that are read; many are too near to the previous one."""
 MOST_PAIRS: Final = SCANS_WATCHED
 """Pairs with a move that are compared, and as many with a turn."""
 ENOUGH_PAIRS: Final = 2 * FEWEST_PAIRS

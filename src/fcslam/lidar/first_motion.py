@@ -18,7 +18,7 @@ from fcslam.records import LaserScan, Sweep, frozen
 from fcslam.sources.motion import STILL_M, STILL_RAD
 
 LONGEST_GAP_S: Final = 1.0
-"""A scan after a longer gap says nothing about the motion during the one before it, nor the reverse."""
+"""A scan after a longer gap says nothing about the motion during the previous one, nor the reverse."""
 PASSES: Final = 8
 """Most matches of the two scans."""
 SIGMAS: Final = 3.0

@@ -178,7 +178,7 @@ class LidarFrontend:
         return self.travel_m - self._begun_m
 
     def begin_local_map(self) -> None:
-        """Forget the surfaces seen so far. The next keyscan is tied to the one before by odometry alone."""
+        """Forget the surfaces seen so far. Only odometry ties the next keyscan to the previous one."""
         self.tracker.empty_buffer()
         self._recent.clear()
         self._begun_m = self.travel_m
@@ -260,7 +260,7 @@ def _tracker(config: LidarConfig, odometry: OdometryModel) -> ScanTracker:
 
 
 def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: OdometryModel) -> FloatArray:
-    """Information (3, 3) of the ``motion`` (3,) to a keyscan from the one before, in the tangent space at the motion.
+    """Information (3, 3) of the ``motion`` (3,) to a keyscan from the previous one, in the tangent space at the motion.
 
     The sum of the points' information and odometry's, limited by a floor of the standard deviations. The error of
     ``odometry`` counts if the scan was not matched or there are no wheels.

@@ -17,7 +17,7 @@ _BIAS_SIGMA, _BIAS_DRIFT, GYRO_NOISE = 0.02, 1e-4, 0.005
 _MATCHED_RAD: Final = 3e-3
 """Standard deviation of a turn between two scans that were matched."""
 _WRONG_RAD, _MOST_WRONG = 0.1, 10
-"""A gyro whose turns differ by more from those of so many scans, less those that agree, measures something else."""
+"""A gyro with a larger error in this many scans, less those where it is right, measures something else."""
 
 
 @dataclass(frozen=True, slots=True)

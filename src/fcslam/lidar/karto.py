@@ -1,7 +1,7 @@
 """Karto's scan matcher (Mapper.cpp, defaults of open_karto): exhaustive search on a smeared likelihood grid.
 
 Only scans that moved on enough are matched, against the keyscans of the running buffer; between them the pose goes on
-by odometry. Near chains and loop closing of Karto are not here: the back end is the same as of ``ScanTracker``.
+by odometry. Near chains and loop closing of Karto are not here: the back end is the same as for ``ScanTracker``.
 """
 
 from typing import Final

@@ -48,7 +48,7 @@ MOST_SELF_IN_FREE: Final = 0.15
 WALL_M: Final = 0.8
 """Walls of at least this length contradict; shorter things are people, furniture and doors."""
 FEWEST_STRETCHES: Final = 20
-"""Of fewer stretches, the noise is taken to be ``NOISE_M``, that of a common laser."""
+"""With fewer stretches, the noise is assumed to be ``NOISE_M``, that of a common laser."""
 NOISE_M: Final = 0.01
 WIDEST_NOISE_M: Final = 10.0 * NOISE_M
 THROUGH_M: Final = 0.5 * STRETCH_M

@@ -19,9 +19,9 @@ ALONG: Final = 0.25
 NO_NORMAL_WEIGHT: Final = 0.5
 """Weight of points without a normal: their surface is uncertain."""
 NEW_MOTION: Final = 1000
-"""A surface is new until the robot has moved by so much since it was first seen, in mm, turns in mrad."""
+"""A surface is new until the robot has moved by this much since it was first seen, in mm, turns in mrad."""
 MOST_NEW: Final = 2.0
-"""Points on new surfaces count together as much as so many times the points on older ones, at most, where that leaves
+"""Largest weight of all points on new surfaces, as a multiple of that of the points on older ones, where that leaves
 each the least weight."""
 LEAST_NEW_WEIGHT: Final = 0.3
 """Least weight of a point on a new surface, as where hardly anything else is seen and odometry may slip."""

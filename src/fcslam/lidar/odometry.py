@@ -2,7 +2,7 @@
 
 A good match measures how far odometry was wrong. These innovations, relative to the model, give the robot its own scale
 of the error. Slips are outliers: the error follows a Student t distribution, whose scale is learned robustly. The part
-that is a share of the motion, as of wheels with another radius, is learned and corrected.
+that is a share of the motion, as of wheels with another radius, is estimated and corrected.
 """
 
 import math

@@ -36,7 +36,7 @@ _GRID: Final = (128, 128, 48), (-12.8, -12.8, -3.2)
 _SIGMA_M: Final = 0.5
 """Standard deviation of a point across its surface, for the information: those of neighbours are correlated."""
 LEAST_SHARE, LARGEST_VIOLATION, LEAST_POINTS = 0.75, 0.06, 600
-"""Of points in known space: least share on surfaces, largest share in free space, and least number on surfaces."""
+"""For points in known space: least share on surfaces, largest share in free space, least number on surfaces."""
 
 
 class SpaceAgreement(NamedTuple):

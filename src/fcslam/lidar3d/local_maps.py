@@ -67,7 +67,7 @@ class Keyframes:
         self.newest: MappedTurn | None = None
         self.vertical = Vertical()
         self.covariance: FloatArray = np.zeros((6, 6))
-        """Of the pose relative to the newest keyframe."""
+        """Covariance of the pose relative to the newest keyframe."""
 
     def add(self, tracked: Tracked, force: FloatArray | None) -> tuple[MappedTurn | None, KeyframeMotion | None]:
         """The turn as a keyframe, with the motion from the one before, or None; ``force`` is that of the IMU."""

@@ -49,7 +49,7 @@ class MotionSensors:
 
     def __init__(self) -> None:
         self.velocity: FloatArray = np.zeros(6)
-        """Of the newest turn, m/s and rad/s in the axes of the robot."""
+        """Velocity of the newest turn, m/s and rad/s in the axes of the robot."""
         self.trust = OdometryTrust()
         self.bias = GyroBias(np.zeros(3))
         self._is_moving_known = False

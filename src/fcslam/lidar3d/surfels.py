@@ -40,7 +40,7 @@ class _Table(NamedTuple):
     row_keys: NDArray[np.int64]
     """Key of each row."""
     stats: FloatArray
-    """Of each voxel: the number of its points, and the sums of them, of their products and of their rays."""
+    """For each voxel the number of its points, and the sums of points, of their products and of their rays."""
     planes: FloatArray
     """Normal, middle, variance along the normal (0: there is no surfel), and variance of the normal."""
     seen: FloatArray

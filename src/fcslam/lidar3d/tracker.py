@@ -25,7 +25,7 @@ MOST_POINTS: Final = 3000
 _GATES_M: Final = (0.4, 0.28, 0.2, 0.14, 0.1, 0.1, 0.1, 0.1, 0.1)
 """Largest distance of a point from its surface in each iteration."""
 _NEAR_SURFACE_M: Final = 0.5
-"""Of the points that are so near to a surface, most are on it if the registration is right."""
+"""Points nearer to a surface mostly lie on it if the registration is right."""
 _CORRELATED: Final = 0.25
 """Information of a point: neighbours have the same error of their surface."""
 _POOR_FACTOR, _POOR_LEAST = 3.0, 0.02
@@ -66,14 +66,14 @@ class Tracked(NamedTuple):
 
 class _Fit(NamedTuple):
     corrections: FloatArray
-    """Of the begin and of the end, shape (2, 6)."""
+    """Corrections of the first and of the last pose, shape (2, 6)."""
     covariance: FloatArray
     """Shape (12, 12)."""
     measured: FloatArray
     """Information by the surfaces, shape (6, 6), in the tangent at the begin."""
     on_surface: int
     share: float
-    """Of the points near a surface, those that are on it."""
+    """Share of the points near a surface that lie on it."""
 
 
 class Tracker3d:

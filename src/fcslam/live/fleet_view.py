@@ -40,8 +40,8 @@ class FleetView:
     ) -> None:
         """Follow nothing before ``start``; ``close`` closes the client.
 
-        ``own_pose`` gives the index of the robot's map and its pose there, if both are known. The tiles are limited to
-        so many kB per second; None: ``DOWNLINK_KB_PER_S``.
+        ``own_pose`` gives the index of the robot's map and its pose there, if both are known. ``limit_kBps``
+        limits the tiles; None: ``DOWNLINK_KB_PER_S``.
         """
         self._client, self._robot, self._own_pose, self.clock = client, robot, own_pose, clock
         self._rng = np.random.default_rng()  # robots must not retry at the same moments

@@ -95,7 +95,7 @@ class JointMap:
     def mark_teammates(self, scan: LaserScan, session: int, newest: RobotPose | None) -> LaserScan:
         """The next scan with the beams marked that hit other robots.
 
-        ``newest`` is the pose of the scan before. ``odom`` is another frame in each session.
+        ``newest`` is the pose of the previous scan. ``odom`` is another frame in each session.
         """
         fleet, radius_m = self._fleet, self._config.robot_radius_m
         before, self._newest = self._newest, (session, scan.T_odom_base)
@@ -132,8 +132,8 @@ def beams_on_teammates(
     door, does not count while a robot says that it is there.
 
     Args:
-        scan: the scan; its odometry says how far the robot drove since the scan before.
-        T_map_before: where the scan before was made, in the frame of ``joint``, shape (3,); read-only, as in a record.
+        scan: the scan; its odometry says how far the robot drove since the previous scan.
+        T_map_before: where the previous scan was made, in the frame of ``joint``, shape (3,); read-only.
         T_odom_before: its odometry, shape (3,); read-only.
         places: of the other robots in that map: x, y and the age of their poses, shape (N, 3), metres and seconds.
         joint, radius_m: the joint map, and the radius of a robot.

@@ -165,7 +165,7 @@ class LiveTracker(ABC):
         return frozen(np.full(3, np.nan)) if given is None else checked_pose("odometry", given)
 
     def _process(self, scan: LaserScan | CloudScan) -> RobotPose:
-        """Localize a scan, and tell what happened. One that repeats the scan before has the pose of that one."""
+        """Localize a scan and report events. A scan that repeats the previous one gets its pose."""
         before = self._frontend.newest
         self._take(self._processed(scan))
         if self._pose is not None and self._frontend.newest is before:

@@ -154,7 +154,7 @@ def covariances(graph: PoseGraph, paths: Sequence[MappedPath], measured: PoseGra
 
 
 def _path_near(edges: EdgeArrays, poses: FloatArray, chosen: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-    """Of the path around the chosen poses: what a metre adds, and what the scans do not see of it.
+    """For the path around the chosen poses: what a metre adds, and what the scans do not see of it.
 
     The covariance that a metre adds along the axes of ``map``, shape (P, 3, 3); and the square of the largest variance
     of a step's position in that of the wheels alone, 1 at most, shape (P,). Both are means over the steps within

@@ -87,7 +87,7 @@ def compare(maps: Sequence[OccupancyMap], periods: Sequence[Period]) -> Changes:
 
 
 def _latest_change(maps: Sequence[OccupancyMap]) -> NDArray[np.int64]:
-    """For each cell the number of the newest map whose state differs from the one before; 0 if none."""
+    """For each cell the number of the newest map whose state differs from the previous one; 0 if none."""
     latest = np.zeros(maps[0].cells.shape, np.int64)
     for number in range(1, len(maps)):
         latest[maps[number].cells != maps[number - 1].cells] = number

@@ -85,7 +85,7 @@ class RobotFrontend:
         """Poses of the scans, by session."""
         self.odometry = WheelOdometry()
         self._motion: Motion = self.odometry
-        """Of the sessions from the next one on."""
+        """Source of the motion in the sessions from the next one on."""
         self.packets = PacketQueue(robot, backend or inline(RobotBackend(robot, config)))
         self.newest: NewestScan | None = None
         """The newest scan; None before the first."""
@@ -112,7 +112,7 @@ class RobotFrontend:
 
     @property
     def belief(self) -> ScanBelief:
-        """Of the newest scan."""
+        """Pose and covariance of the newest scan."""
         assert self.newest is not None
         pose, tracked, _, _ = self.newest
         points = None if tracked.scan is None else tracked.information

@@ -50,7 +50,7 @@ class NewestTurn(NamedTuple):
     pose: ScanPose
     tracked: Tracked
     covariance: FloatArray
-    """Of the motion since the last keyscan, in its tangent, shape (6, 6)."""
+    """Covariance of the motion since the last keyscan, in its tangent, shape (6, 6)."""
     quality: float = math.nan
 
     @property
@@ -99,7 +99,7 @@ class RobotFrontend3d:
 
     @property
     def belief(self) -> ScanBelief:
-        """Of the newest turn."""
+        """Pose and covariance of the newest turn."""
         assert self.newest is not None
         return ScanBelief(self.newest.tracked.measured, partial(np.array, self.newest.covariance))
 

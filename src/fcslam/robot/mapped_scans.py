@@ -27,7 +27,7 @@ class MappedScans:
         self._ignore, self._footprint = ignore, footprint
         self._lasers: list[LaserModel] = []
         self._last: tuple[LaserModel, int, LaserModel] | None = None
-        """The laser of the scan before, every which beam is mapped, and the laser with these."""
+        """The laser of the previous scan, the stride of its mapped beams, and the laser with these beams."""
 
     def of(self, scan: LaserScan) -> LaserScan:
         """The scan as it is mapped.

@@ -42,7 +42,7 @@ class MotionPrediction:
 
     def __init__(self) -> None:
         self._T_odom_base = self._T_odom_last = np.zeros(3)
-        """Of the newest scan and of the scan before."""
+        """Odometry of the newest scan and of the previous one."""
         self._motion = np.zeros(3)
         """Between the last two scans, in the tangent space of the base (x, y, theta)."""
         self._elapsed_s = 0.0
@@ -99,7 +99,7 @@ class MotionPrediction:
         return self._sweep is not None and 0.0 < elapsed_s <= LARGEST_SHARE * self._sweep.duration_s
 
     def moving(self, scan: LaserScan, T_smooth_base: FloatArray) -> LaserScan:
-        """A scan that was found at ``T_smooth_base``, with the velocity from the scan before to there in its sweep.
+        """A scan that was found at ``T_smooth_base``, with the velocity since the previous scan in its sweep.
 
         A velocity that was taken over from sweep to sweep may be wrong and fit nevertheless, as all surfaces around are
         distorted alike. The poses at the stamps show the true one.

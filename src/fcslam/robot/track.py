@@ -59,7 +59,7 @@ class ScanTrack:
             del self._T_keyscan_base[-self._size :]
 
     def extend(self, motion: FloatArray) -> None:
-        """Append the next keyscan by the motion to it from the one before, shape (P,), as it is sent to the cloud."""
+        """Append the next keyscan by the motion to it from the previous one, shape (P,), as it is sent to the cloud."""
         self._T_odom_keyscan.extend(self._group.compose(np.array(self._T_odom_keyscan[-self._size :]), motion))
 
     def in_odom(self, pose: ScanPose) -> FloatArray:

@@ -82,7 +82,7 @@ class WheelOdometry:
         self.jumps = 0
         """Number of jumps so far."""
         self._last: tuple[float, FloatArray] | None = None
-        """Stamp and pose, as it was read, of the scan before."""
+        """Stamp and pose, as it was read, of the previous scan."""
         self._bridge: FloatArray | None = None
         """The present frame ``odom`` in the first one, shape (3,); None before the first jump."""
         self._motion: se2.Pose = (LEAST_BRIDGE_M, 0.0, 0.0)
@@ -147,7 +147,7 @@ def is_jump(motion: se2.Pose, within_s: float) -> bool:
 
 
 def moving_on(scan: LaserScan, before: LaserScan) -> LaserScan:
-    """The scan with the velocity since the one before, by odometry, in its sweep."""
+    """The scan with the velocity since the previous one, by odometry, in its sweep."""
     elapsed_s = scan.stamp - before.stamp
     if scan.sweep is None or not 0.0 < elapsed_s <= LONGEST_GAP_S:
         return scan

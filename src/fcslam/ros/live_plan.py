@@ -47,9 +47,9 @@ class FirstMessages(Messages):
         self._census = {topic: TopicCensus(number) for number, topic in enumerate(self.by_name.values())}
         self._kept: deque[BagMessage] = deque(maxlen=_LONGEST_WAIT)
         self.counts: Counter[Topic] = Counter()
-        """Of those that were kept."""
+        """Number of scans kept of each topic."""
         self._frames: dict[Topic, str] = {}
-        """Of the first scan of each topic."""
+        """Frame of the first scan of each topic."""
 
     @property
     def census(self) -> Mapping[Topic, TopicCensus]:
@@ -113,7 +113,7 @@ class LivePlan(NamedTuple):
     sensors: BagPlan
     rig: Rig
     clouds: CloudReader | None
-    """Of a robot with a 3D LiDAR."""
+    """Reader of the clouds of a 3D LiDAR; None without one."""
 
 
 class LivePlanner:

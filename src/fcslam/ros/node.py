@@ -96,12 +96,12 @@ class RobotNode:
         self._codec = MessageCodec(ros1=False)
         self._inbox = Inbox(notify=self._tell_once)
         self._names: queue.Queue[str] = queue.Queue(_NAMES_WAITING)
-        """Of the files of maps to be saved."""
+        """Names of the map files to save."""
         self._stop = threading.Event()
         self._told: set[str] = set()
         self.scans = 0
         self._points: FloatArray | None = None
-        """Of the map in space, as they were published last."""
+        """Points of the 3D map that were published last."""
         self._pose: RobotPose | None = None
         self._state: tuple[bool, float] | None = None
         """Whether the robot knows its pose in the map, and since which stamp."""

@@ -233,6 +233,6 @@ def dds_type(kind: str) -> str:
 
 
 def kind_of(dds_type: str) -> str | None:
-    """The type of messages with this name; None: it is no such name."""
+    """The type of messages with this name; None: there is no such type."""
     match = _TYPE.fullmatch(dds_type)
     return f"{match[1]}/{match[2]}" if match else None

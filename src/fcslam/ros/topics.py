@@ -26,7 +26,7 @@ class SensorTopics:
     camera: str | None = None
     camera_info: str | None = None
     fixes: str | None = None
-    """Of satellite navigation."""
+    """Topic of satellite navigation."""
     notes: tuple[str, ...] = ()
     imu: str | None = None
     in_space: bool = False

@@ -48,7 +48,7 @@ class AuditLog:
     def __init__(
         self, append: Callable[[bytes], object], lines: Callable[[int], list[bytes]], wall_clock: Callable[[], float]
     ) -> None:
-        """``append`` appends a line; ``lines`` gives at most so many newest ones, the oldest of them first."""
+        """``append`` appends a line; ``lines(limit)`` gives the newest ones, oldest first."""
         self._append, self._lines, self._wall_clock = append, lines, wall_clock
         self._refused, self._refused_from = 0, ""
         """Refused logins that have no line yet, and where the last one came from."""
@@ -77,7 +77,7 @@ class AuditLog:
             self._refused, self._line_at = 0, self._wall_clock() + REFUSED_EVERY_S
 
     def newest(self, limit: int) -> list[AuditEntry]:
-        """At most so many newest entries, the oldest of them first; a line that is torn is left out."""
+        """Up to ``limit`` newest entries, oldest first; a torn line is left out."""
         entries: list[AuditEntry] = []
         for line in self._lines(limit):
             with suppress(ValueError, TypeError):

@@ -51,7 +51,7 @@ class JointSession:
     pose: tuple[float, float, float]
     """``T_map_base`` of its newest keyscan."""
     stamp: float
-    """Of that keyscan, seconds."""
+    """Stamp of that keyscan, seconds."""
     heard_s: float
     """When that took effect, seconds since 1970; 0: not known."""
 

@@ -28,7 +28,7 @@ IMPORT, EXPORT = ".import", ".export"
 
 
 class UnknownMissionError(InputError):
-    """There is no mission of a name."""
+    """There is no mission of this name."""
 
     def __init__(self, name: str, names: Iterable[str]) -> None:
         super().__init__(f"there is no mission '{name}'; there are {', '.join(names)}")

@@ -93,7 +93,7 @@ class CloudReader:
     """Points nearer to the vertical through ``base`` are of the robot itself."""
 
     def scan(self, cloud: PointCloud, wheels: FloatArray, imu: FloatArray) -> CloudScan:
-        """The record of a cloud with the readings since the one before; raises ValueError if it has few points."""
+        """The record of a cloud with the readings since the previous one; raises ValueError if it has few points."""
         if len(cloud.points) < _FEWEST_POINTS:
             raise ValueError(f"{len(cloud.points)} points are not a turn of a 3D LiDAR")
         points = cloud.points @ self.mounting.rotation.T + self.mounting.position_m

@@ -1,6 +1,6 @@
 """Finds scans that say nothing or contradict the odometry, so that a frozen encoder or scanner does not pass unnoticed.
 
-- A scan has the ranges of the scan before to the last bit, and the odometry moved, or the stamp is the same: a driver
+- A scan has exactly the ranges of the previous scan, and the odometry moved, or the stamp is the same: a driver
   repeats it, or it was recorded twice. A robot skips it.
 - A scan has no return, as of a covered laser. It clears nothing (``fcslam.robot.mapped_scans``).
 - The odometry stands still and the scan changes: most beams measure another range than when it began to stand. The
@@ -32,7 +32,7 @@ class RepeatedScans:
         """The newest scan of each laser, by its mounting."""
 
     def admits(self, scan: LaserScan) -> bool:
-        """Whether the next scan does not repeat the one before of its laser."""
+        """Whether the next scan does not repeat the previous one of its laser."""
         before = self._newest.get(scan.laser.T_base_laser)
         if before is not None and _repeats(before, scan):
             return False

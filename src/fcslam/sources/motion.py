@@ -24,7 +24,7 @@ LARGEST_ACCELERATION: Final = 50.0
 
 
 ROUNDING: Final = 1e-9
-"""A reading that differs by less, in metres and radians, repeats the one before."""
+"""A reading that differs by less, in metres and radians, repeats the previous one."""
 FEWEST_STEPS: Final = 4
 """Steps of a moving robot that show it."""
 LONGEST_UPDATE_S: Final = 0.35
@@ -49,7 +49,7 @@ class OdometryUpdates:
         self._moves = self._steps = 0
         """Updates of a moving robot, and those after repeats."""
         self._update: tuple[float, Pose] | None = None
-        """Stamp and pose of the newest reading that differs from the one before."""
+        """Stamp and pose of the newest reading that differs from the previous one."""
         self._repeats = 0
 
     @property

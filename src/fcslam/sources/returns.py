@@ -51,7 +51,7 @@ class FloorLine(NamedTuple):
 
     distance_m: float
     heading_rad: float
-    """Of its nearest point, among the angles of the beams."""
+    """Direction of its nearest point, among the angles of the beams."""
 
     def __str__(self) -> str:
         """What is wrong, and what to do."""

@@ -37,8 +37,8 @@ def next_weights(
 ) -> tuple[Weights, Weights]:
     """The next global weights and the momentum after the round, which is counted from 1.
 
-    ``updates`` passed screening; they were trained from ``old``. ``momentum`` is that after the round before; empty at
-    first, and after a return to an earlier version.
+    ``updates`` passed screening; they were trained from ``old``. ``momentum`` is that after the previous round; empty
+    at first, and after a return to an earlier version.
     """
     aggregated = {name: np.asarray(array, np.float32) for name, array in aggregate(round_number, updates).items()}
     reason, following = weights_error(aggregated, old), aggregated

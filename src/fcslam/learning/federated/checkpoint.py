@@ -34,7 +34,7 @@ class CoordinatorState:
     best_round: int = 0
     """The round that made the released weights; 0 if they are the initial ones."""
     momentum: Weights = field(default_factory=dict)
-    """Of the aggregation, carried from round to round; empty before the first one."""
+    """Momentum of the aggregation, carried from round to round; empty before the first one."""
     times_asked: Mapping[str, int] = field(default_factory=dict)
     """How often each robot was asked to train: an upper bound of the updates that have left it."""
     update_length: float = 0.0

@@ -105,7 +105,7 @@ class RobotClient:
             return {"moments": {}}
 
     def _keep(self, request: TrainingRequest, state: State, optimizer_state: Mapping[str, Tensor]) -> None:
-        """Keep the optimizer's state, and that of the round before: a server that was killed may repeat the round."""
+        """Keep the optimizer's state, and that of the previous round: a server that was killed may repeat the round."""
         before = _round_before(state, request.round_number)
         kept = {} if before is None else {before: state["moments"][before]}
         kept[str(request.round_number)] = {name: value.cpu().numpy() for name, value in optimizer_state.items()}

@@ -48,7 +48,7 @@ class TrainingReply:
 
     robot: str
     version: str
-    """Of the weights in the request."""
+    """Version of the weights in the request."""
     arrays: Weights = field(default_factory=dict)
     figures: Mapping[str, float] = field(default_factory=dict)
     """Losses."""

@@ -26,7 +26,7 @@ class Evaluation:
     score: float = math.nan
     """By which versions are compared, in [0, 1]."""
     gain: float = math.nan
-    """Of the score over that of the released version."""
+    """Gain of the score over that of the released version."""
     released: bool = False
     """Whether it is the new detector."""
     reason: str = ""

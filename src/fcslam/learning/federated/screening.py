@@ -39,13 +39,13 @@ class ScreeningBounds:
     """Bounds beyond which an update is refused; malformed and non-finite updates are always refused."""
 
     largest_change: float = 1.0
-    """Of the norm of an update, as a multiple of the norm of the weights."""
+    """Largest norm of an update, as a multiple of the norm of the weights."""
     longest: float = 3.0
-    """Of the norm of an update, as a multiple of the median norm in the round."""
+    """Largest norm of an update, as a multiple of the median norm in the round."""
     least_agreement: float = -0.02
-    """Of the cosine between an update and the mean direction of the others."""
+    """Least cosine between an update and the mean direction of the others."""
     statistics_distance: float = 0.4
-    """Of the distance of batch statistics from the median of three robots or more, in standard deviations, root mean
+    """Largest distance of batch statistics from the median of three robots or more, in standard deviations, root mean
     square over the channels."""
     clips: bool = True
     """Whether longer updates than the median of a round are shortened to it, so that none counts for several."""
@@ -67,7 +67,7 @@ def screen(
     their change is checked separately, and its direction is not checked. Instead they must be close to those of the
     other robots: these differ much less from one another than from the ones that were sent. ``sent`` are the weights
     that all robots trained from. ``frozen``: batch statistics must come back unchanged. ``earlier_length``:
-    ``update_length`` of the round before; 0 in the first round.
+    ``update_length`` of the previous round; 0 in the first one.
     """
     refused = {robot: reason for robot, weights in updates.items() if (reason := weights_error(weights, sent))}
     parameters = parameter_names(sent)

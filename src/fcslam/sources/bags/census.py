@@ -54,7 +54,7 @@ from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.untrusted import ZSTD, LimitError, unpack
 
 _LATEST_NS: Final = int(np.iinfo(np.int64).max)
-"""Of a damaged file, some times are larger."""
+"""Larger times are of a damaged file."""
 _ROWS_AT_ONCE: Final = 256
 _KEPT: Final = (*LASER_SCANS, ODOMETRY, *TRANSFORM_KINDS)
 _COUNTED: Final = (*SCANS, ODOMETRY, *TRANSFORM_KINDS)
@@ -134,7 +134,7 @@ class BagMessage(NamedTuple):
     unstamped_ns: int
     """The stamp if it has none."""
     decoded: Any
-    """Of laser scans, odometry and tf as in ``Content``; of other types an object of rosbags. An error if invalid."""
+    """Laser scans, odometry and tf as in ``Content``; other types as objects of rosbags. An error if invalid."""
 
     @property
     def content(self) -> Any:
@@ -155,7 +155,7 @@ class Messages(ABC):
 
     path: Path
     namespace = ""
-    """Of the robot, if the messages of tf may be of others, too."""
+    """Namespace of the robot, if the messages of tf may be of others, too."""
 
     @property
     def label(self) -> str:

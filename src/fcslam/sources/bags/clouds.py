@@ -17,7 +17,7 @@ from fcslam.sources.point_clouds import CloudMounting, PointCloud, depth_points
 MOST_POINTS: Final = 4_000_000
 """In one message; the largest scanners measure a tenth of it in a turn."""
 _TYPES: Final = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
-"""Of the values of sensor_msgs/PointField, by their number."""
+"""Types of sensor_msgs/PointField, by their number."""
 TIMES: Final = ("time", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "timeoffset", "ts")
 _UNITS_S: Final = (1.0, 1e-3, 1e-6, 1e-9)
 _SHORTEST_CLOUD_S: Final = 5e-3
@@ -27,7 +27,7 @@ _OVER_INTERVAL: Final = 1.2
 _LONGEST_IN_SECONDS: Final = 0.9
 """Times of points that are seconds span less: from 0 to 1 they are shares of a turn."""
 _REACH: Final = 4.0
-"""Times farther from the middle half of all than this many times its duration are wrong, as of lost packets."""
+"""Times farther from the middle half of all than this many times its duration are wrong, as after lost packets."""
 _SCATTERED: Final = 20.0
 """Ratio of the middle half of all times to the shortest half that no turn has."""
 _DEPTHS: Final = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}

@@ -25,7 +25,7 @@ _REMEDIES = {
     SQLITE_MAGIC: "copy it again, or mend it with `ros2 bag reindex`",
 }
 _LONGEST_PAUSE_NS, _LONGEST_OVERLAP_NS = 60 * NANOSECONDS, NANOSECONDS
-"""Of the scans in two parts of one recording, from the end of one to the beginning of the next."""
+"""Limits of the time between the scans of two parts of one recording."""
 
 
 class Topic(NamedTuple):

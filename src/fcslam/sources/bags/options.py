@@ -29,7 +29,7 @@ class BagCorrection:
     upside_down: bool = False
     """Whether the laser is upside down where the bag says that it is upright, or the other way round."""
     floors: tuple[FloorLine | None, ...] = ()
-    """Of each laser, mounted as the bag says: where it sees the floor, which is left out. Empty: none does."""
+    """For each laser, where it sees the floor, which is left out. Empty: none does."""
 
 
 UNCORRECTED: Final = BagCorrection()

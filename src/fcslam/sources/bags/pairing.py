@@ -44,7 +44,7 @@ class PosedScan(NamedTuple):
     fault: Fault | None
     """Fault of the pose; with NO_ODOMETRY the pose is the identity."""
     gyro: FloatArray | None = None
-    """Readings of a gyro since the scan before, as in ``LaserScan``."""
+    """Readings of a gyro since the previous scan, as in ``LaserScan``."""
 
 
 class PosedImage(NamedTuple):

@@ -34,7 +34,7 @@ from fcslam.sources.returns import is_apart
 USUAL_ODOM: Final = "odom"
 """Frame of an odometry that names none."""
 _STRIDE = 5
-"""Of the scans that show whether a robot moves, every such one is compared."""
+"""Every fifth scan is compared to see whether the robot moves."""
 EACH_LASER: Final = "give one for each laser, in the same order"
 
 
@@ -76,10 +76,10 @@ class BagPlan(NamedTuple):
     fixes: Topic | None
     fixes_ahead_s: float
     imu: Topic | None
-    """Of a robot without odometry, or with a 3D LiDAR."""
+    """IMU of a robot without odometry, or with a 3D LiDAR."""
     imu_reader: ImuReader
     calibration: Calibration | None
-    """Of the camera; None without a camera or a readable calibration."""
+    """Calibration of the camera; None without a camera or a readable calibration."""
     notes: tuple[str, ...]
     """About odometry and clocks."""
 

@@ -18,7 +18,7 @@ from fcslam.untrusted import MOST_STREAM_RATIO, check_unpacked, open_database, o
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V", b"\x89MCAP0\r\n", b"SQLite format 3\x00"
 LARGEST_CHUNK_BYTES = 256_000_000
-"""Of a chunk without compression, which is read as one; recorders write some megabytes."""
+"""Largest decompressed chunk, which is read as one; recorders write some megabytes."""
 _KEPT_BYTES = 8_000_000
 """Unpacked chunks that are kept while messages of several chunks are read in turn."""
 _REREAD_RATIO = 10 * MOST_STREAM_RATIO

@@ -54,7 +54,7 @@ class _Member:
 
     @property
     def frame(self) -> str:
-        """Of its first scan."""
+        """Frame of its first scan."""
         return next(iter(self.scan_frames.values()))[0]
 
     @property

@@ -85,7 +85,7 @@ class TransformTree:
 
     def __init__(self) -> None:
         self._parents: dict[str, list[str]] = {}
-        """Of each frame, in the order in which they appeared; usually one."""
+        """Parents of each frame, in the order in which they appeared; usually one."""
         self.links: dict[Link, Transform | None] = {}
         """The first transform of each link, in the order in which they appeared; None if it moves."""
 

@@ -51,7 +51,7 @@ BROKEN = -(2**63)
 UNTIMED_STEP_S = 1.0
 """Time between the scans of a log that states none."""
 _DIGITS = 15
-"""Numbers of so many digits and their power of ten are exact in double precision: their ratio is rounded once."""
+"""Numbers of up to this many digits and powers of ten are exact in double precision: their ratio is rounded once."""
 _POWERS = 10.0 ** np.arange(_DIGITS + 1)
 
 
@@ -68,7 +68,7 @@ class CarmenArrays:
         self.numbers, self.contents = array("q"), array("q")
         """Numbers, from 1, of the lines that are used, and what each holds: k is scan k, ``~k`` is reading k."""
         self.stamps, self.odometry_stamps = array("d"), array("d")
-        """Of the scans and the readings, seconds."""
+        """Stamps of the scans and of the odometry readings, seconds."""
         self.untimed = set[int]()
         """Scans whose stamps the log does not state."""
         self.invalid: dict[int, int] = {}
@@ -101,12 +101,12 @@ class CarmenArrays:
                 check_unpacked(size, 4 * len(self._ranges_m) + 16 * len(self.numbers))
         poses: FloatArray = frozen(np.frombuffer(self._poses).reshape(-1, 6))
         self.T_odom_laser, self.T_odom_base = poses[:, :3], poses[:, 3:]
-        """Of the scans, shape (S, 3)."""
+        """Poses of laser and base at the scans, shape (S, 3)."""
         self.odometry: FloatArray = frozen(np.frombuffer(self._odometry).reshape(-1, 3))
         """T_odom_base of the readings, shape (R, 3)."""
         ranges_m: Ranges = frozen(np.frombuffer(self._ranges_m, np.float32), np.float32)
         self.ranges_m = [ranges_m[begin:end] for begin, end in pairwise(self._ends)]
-        """Of each scan; those that are negative, not finite or too large are NaN."""
+        """Ranges of each scan; NaN where negative, not finite or too large."""
 
     def beams_of(self, scan: int, declared: Beams) -> Beams | None:
         """The beams that a scan states, or those of the laser; None if there are more or fewer and no angles."""
