@@ -99,6 +99,8 @@ class CarmenArrays:
                     self.numbers.append(number)
                     self.contents.append(content)
                 check_unpacked(size, 4 * len(self._ranges_m) + 16 * len(self.numbers))
+        if 1 < len(self.stamps) > 100 * (len(set(self.stamps)) - 1):  # such as 1.01893e+09, with six digits
+            self._number_scans()
         poses: FloatArray = frozen(np.frombuffer(self._poses).reshape(-1, 6))
         self.T_odom_laser, self.T_odom_base = poses[:, :3], poses[:, 3:]
         """Poses of laser and base at the scans, shape (S, 3)."""
@@ -114,6 +116,14 @@ class CarmenArrays:
         if stated is not None:
             return stated.beams
         return declared if len(self.ranges_m[scan]) == declared.beam_count else None
+
+    def _number_scans(self) -> None:
+        self.stamps, self.untimed = array("d"), set(range(len(self.stamps)))
+        for content in self.contents:
+            if content >= 0:
+                self.stamps.append(len(self.stamps) * UNTIMED_STEP_S)
+            elif content != BROKEN:
+                self.odometry_stamps[~content] = len(self.stamps) * UNTIMED_STEP_S
 
     def _flaser(self, line: bytes) -> int:
         front, *tail = line.rsplit(None, 9)
