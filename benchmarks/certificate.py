@@ -36,7 +36,7 @@ from fcslam.records import FloatArray
 from fcslam.runs import Run, open_run
 from fcslam.runs.tables import read_tum
 from fcslam.sources.faults import Faults
-from fcslam.sources.source import WHOLE, Survey
+from fcslam.sources.source import Survey
 
 BAR_M = 0.05
 DIFFERENT = "other", "mirrored", "shifted", "refurnished"
@@ -61,11 +61,11 @@ class Simulated:
     def __init__(self, robot):
         self._robot, self.name = robot, robot.name
 
-    def survey(self, _scans=WHOLE):
+    def survey(self):
         robot = self._robot
         return Survey(len(robot.stamps), robot.duration_s, 0.0, robot.lasers, self.faults)
 
-    def records(self, _scans=WHOLE):
+    def records(self):
         return self._robot.scans()
 
 

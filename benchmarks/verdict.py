@@ -31,8 +31,9 @@ from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_f
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.runs import Run, Use, open_run
 from fcslam.runs.tables import write_tum
-from fcslam.sources import ScanRange, open_source
+from fcslam.sources import open_source
 from fcslam.sources.bags.writer import write_bag
+from fcslam.sources.source import Part
 
 WRONG_M, BENT_M, LEAST_PATH_M = 0.5, 0.25, 5.0
 FEWEST_RIGHT = 38
@@ -143,7 +144,7 @@ def cut(recording: Path, place: Path) -> Path:
     target = place / f"{recording.name}.mcap"
     target.parent.mkdir(parents=True, exist_ok=True)
     if not target.exists():
-        write_bag(target, open_source(recording).records(ScanRange(0, CUT_SCANS)))
+        write_bag(target, Part(open_source(recording), 0, CUT_SCANS, recording.name).records())
     return target
 
 

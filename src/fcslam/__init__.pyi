@@ -56,7 +56,6 @@ from fcslam.sources import BagOptions as BagOptions
 from fcslam.sources import Fault as Fault
 from fcslam.sources import FaultCount as FaultCount
 from fcslam.sources import Faults as Faults
-from fcslam.sources import ScanRange as ScanRange
 from fcslam.sources import Source as Source
 from fcslam.sources import Survey as Survey
 from fcslam.sources.point_clouds import CloudBand as CloudBand

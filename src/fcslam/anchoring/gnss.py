@@ -11,10 +11,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.anchoring.part import LEAST_SIGMA_M, ROUNDS, MapPart, position_prior
+from fcslam.anchoring.part import LEAST_SIGMA_M, ROUNDS, MapPart, Positions
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
-from fcslam.graph.optimizer import optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray
 
@@ -64,30 +63,15 @@ class Georeference:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Measured:
-    variables: NDArray[np.int64]
-    arms: FloatArray
-    """The antenna in the base of the keyscan, shape (N, 2)."""
-    east_north: FloatArray
-    """Shape (N, 2), metres."""
-    sigma_m: FloatArray
-    """Shape (N,)."""
-    spread: float
-    """Factor by which correlation in time enlarges the standard deviations."""
+class _Measured(Positions):
+    """Positions of antennas, metres east and north."""
+
     factor: float = 1.0
     """Factor by which the standard deviations are larger than stated."""
 
-    def antennas(self, poses: FloatArray) -> FloatArray:
-        """Positions of the antenna, shape (N, 2), by poses of the variables."""
-        at = poses[self.variables]
-        cos, sin = np.cos(at[:, 2]), np.sin(at[:, 2])
-        x, y = self.arms.T
-        antennas: FloatArray = at[:, :2] + np.column_stack((cos * x - sin * y, sin * x + cos * y))
-        return antennas
-
     def off(self, antennas: FloatArray) -> FloatArray:
         """How far positions of the antenna (N, 2) are from the fixes, in their standard deviations; shape (N,)."""
-        off: FloatArray = np.hypot(*(antennas - self.east_north).T) / self.sigma_m
+        off: FloatArray = np.hypot(*(antennas - self.xy).T) / self.sigma_m
         return off
 
 
@@ -114,22 +98,23 @@ def georeferenced(part: MapPart, is_fixed: bool) -> Georeference | None:
         np.array([fix.antenna_xy for fix in kept]),
         east_north,
         np.maximum(LEAST_SIGMA_M, stated_m),
-        max(1.0, CORRELATED_S / max(interval_s, 1e-3)) ** 0.5,
     )
+    # Correlation in time enlarges the standard deviations.
+    spread = max(1.0, CORRELATED_S / max(interval_s, 1e-3)) ** 0.5
     poses = part.graph.poses()
-    antennas = measured.antennas(poses)
+    antennas = measured.points(poses)
     measured, T, agreeing = _vote(measured, antennas)
-    refusal = _refusal(measured, T, antennas, agreeing)
+    refusal = _refusal(measured, T, antennas, agreeing, spread)
     if refusal or agreeing.mean() < 1.0 / CLEARLY_MORE:
         count = int(agreeing.sum())
-        if explanation := _explanation(measured, antennas, positions, 0 if refusal else count):
+        if explanation := _explanation(measured, antennas, positions, 0 if refusal else count, spread):
             refusal = f"{refusal or f'{count} of {len(agreeing)} fixes agree'}; {explanation}"
     sigma_m = float(np.median(measured.sigma_m))
     sigmas_m = sigma_m, float(np.median(stated_m)) if measured.factor > 1.0 else sigma_m
     if refusal:
         return Georeference(part, len(kept), int((~agreeing).sum()), refusal, *sigmas_m)
     if not is_fixed:
-        poses, agreeing = _solve(part.graph, se2.compose(T, poses), measured, agreeing)
+        poses, agreeing = _solve(part.graph, se2.compose(T, poses), measured, agreeing, spread)
         part, T = part.at(poses), np.zeros(3)
     longitude, latitude = projection(*T[:2].tolist(), inverse=True)
     ignored = int((~agreeing).sum())
@@ -159,7 +144,7 @@ def _vote(measured: _Measured, antennas: FloatArray) -> tuple[_Measured, FloatAr
         i, j = rng.integers(len(antennas), size=2)
         if not np.hypot(*(antennas[i] - antennas[j])) > apart_m:
             continue
-        T = n_point_alignment(measured.east_north[[i, j]], antennas[[i, j]])
+        T = n_point_alignment(measured.xy[[i, j]], antennas[[i, j]])
         distances = measured.off(se2.transform(T, antennas))
         if (reach := np.partition(distances, needed)[needed]) < nearest:
             best, off, nearest = T, distances, reach
@@ -168,7 +153,7 @@ def _vote(measured: _Measured, antennas: FloatArray) -> tuple[_Measured, FloatAr
         if agreeing.sum() < 2:
             break
         weights = measured.sigma_m[agreeing] ** -2.0
-        T = n_point_alignment(measured.east_north[agreeing], antennas[agreeing], weights)
+        T = n_point_alignment(measured.xy[agreeing], antennas[agreeing], weights)
         if not np.isfinite(T).all():
             break
         best, off = T, measured.off(se2.transform(T, antennas))
@@ -182,18 +167,20 @@ def _needed(count: int) -> int:
     return max(LEAST_FIXES, round(LEAST_SHARE * count))
 
 
-def _refusal(measured: _Measured, T: FloatArray, antennas: FloatArray, agreeing: NDArray[np.bool_]) -> str:
+def _refusal(
+    measured: _Measured, T: FloatArray, antennas: FloatArray, agreeing: NDArray[np.bool_], spread: float
+) -> str:
     count, sigmas_m = int(agreeing.sum()), measured.sigma_m
     if count < _needed(len(agreeing)):
         return f"{count} of {len(agreeing)} fixes agree, {_needed(len(agreeing))} needed"
     if measured.factor > 1.0 and np.median(sigmas_m) > MOST_SPREAD * np.hypot(*antennas.std(axis=0)):
         return f"the fixes differ by {np.median(sigmas_m):.1f} m from the path of the robots"
-    at = measured.east_north[agreeing] - measured.east_north[agreeing].mean(axis=0)
+    at = measured.xy[agreeing] - measured.xy[agreeing].mean(axis=0)
     sigma_m = float(np.sqrt(np.mean(sigmas_m[agreeing] ** 2)))
-    if len(agreeing) >= LEAST_INDEPENDENT * measured.spread**2:  # they may be better than they state, too
+    if len(agreeing) >= LEAST_INDEPENDENT * spread**2:  # they may be better than they state, too
         off_m = (measured.off(se2.transform(T, antennas)) * sigmas_m)[agreeing]
         sigma_m = min(sigma_m, float(np.sqrt(0.5 * np.mean(off_m**2))))
-    turn_rad = measured.spread * sigma_m / max(1e-9, float(np.sqrt((at**2).sum())))
+    turn_rad = spread * sigma_m / max(1e-9, float(np.sqrt((at**2).sum())))
     if turn_rad > MOST_TURN_RAD:
         return (
             f"the fixes fix the map's heading to {np.degrees(turn_rad):.1f} deg only, "
@@ -202,42 +189,32 @@ def _refusal(measured: _Measured, T: FloatArray, antennas: FloatArray, agreeing:
     return ""
 
 
-def _explanation(measured: _Measured, antennas: FloatArray, positions: FloatArray, count: int) -> str:
+def _explanation(measured: _Measured, antennas: FloatArray, positions: FloatArray, count: int, spread: float) -> str:
     """With which change of the coordinates clearly more than ``count`` fixes agree; empty if with none."""
     stated = replace(measured, sigma_m=measured.sigma_m / measured.factor, factor=1.0)
-    size = np.hypot(*measured.east_north.std(axis=0)) / np.hypot(*antennas.std(axis=0))
+    size = np.hypot(*measured.xy.std(axis=0)) / np.hypot(*antennas.std(axis=0))
     changed = {
-        "east and north exchanged, or a sign lost": measured.east_north[:, ::-1],
-        f"a scale of {size:.3g}": measured.east_north / size,
+        "east and north exchanged, or a sign lost": measured.xy[:, ::-1],
+        f"a scale of {size:.3g}": measured.xy / size,
     }
     exchanged, degrees = positions[:, ::-1], np.degrees(positions)
     for name, each in (("latitude and longitude exchanged", exchanged), ("radians for degrees", degrees)):
         if np.abs(each).max() <= 90.0:
             changed[name] = _projected(each)[1]
     for name, east_north in reversed(changed.items()):
-        its, T, agreeing = _vote(replace(stated, east_north=east_north), antennas)
-        if agreeing.sum() > CLEARLY_MORE * count and not _refusal(its, T, antennas, agreeing):
+        its, T, agreeing = _vote(replace(stated, xy=east_north), antennas)
+        if agreeing.sum() > CLEARLY_MORE * count and not _refusal(its, T, antennas, agreeing, spread):
             return f"with {name}, {agreeing.sum()} of {len(agreeing)} agree: correct the driver of the receiver"
     return ""
 
 
 def _solve(
-    graph: PoseGraph, poses: FloatArray, measured: _Measured, agreeing: NDArray[np.bool_]
+    graph: PoseGraph, poses: FloatArray, measured: _Measured, agreeing: NDArray[np.bool_], spread: float
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
+    spreading = replace(measured, sigma_m=spread * measured.sigma_m)
     for _ in range(ROUNDS):
-        arms = measured.antennas(poses) - poses[measured.variables, :2]
-        priors = [
-            position_prior(
-                variable,
-                measured.east_north[row] - arms[row],
-                poses[variable, 2],
-                (measured.spread * measured.sigma_m[row]) ** -2.0,
-            )
-            for row, variable in enumerate(measured.variables.tolist())
-            if agreeing[row]
-        ]
-        poses = optimize_anchored(graph, poses, priors)
-        before, agreeing = agreeing, measured.off(measured.antennas(poses)) < OUTLIER
+        poses = spreading.solved(graph, poses, agreeing)
+        before, agreeing = agreeing, measured.off(measured.points(poses)) < OUTLIER
         if np.array_equal(before, agreeing):
             break
     return poses, agreeing

@@ -5,17 +5,18 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.geometry import se2
-from fcslam.graph.optimizer import PosePrior
+from fcslam.graph.optimizer import PosePrior, optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray, frozen
 
 LEAST_SIGMA_M: Final = 0.02
 """Least standard deviation of a position outside of the map, by a survey or a receiver, whatever they say."""
 ROUNDS: Final = 4
-"""Finding what such positions say about the poses, and solving, alternate this often."""
+"""Such positions are linearized, and poses are solved, this often."""
 _HEADING_INFORMATION: Final = 1e-6
 
 
@@ -74,9 +75,35 @@ def with_part(result: FleetResult, k: int, part: MapPart) -> FleetResult:
     return replace(result, robots=robots, corrections=corrections, graph=graph, regions=regions)
 
 
-def position_prior(variable: int, xy: FloatArray, heading_rad: float, information: float) -> PosePrior:
-    """A measured position (2,) of a variable; the solver needs some information about its heading."""
-    return PosePrior(variable, np.append(xy, heading_rad), np.diag((information, information, _HEADING_INFORMATION)))
+@dataclass(frozen=True, slots=True, eq=False)
+class Positions:
+    """Positions, outside of the map, of points that robots carry or see."""
+
+    variables: NDArray[np.int64]
+    """Of the keyscans, shape (N,)."""
+    arms: FloatArray
+    """The points in the base of the keyscans, shape (N, 2)."""
+    xy: FloatArray
+    """Shape (N, 2), metres."""
+    sigma_m: FloatArray
+    """Shape (N,)."""
+
+    def points(self, poses: FloatArray) -> FloatArray:
+        """Where the points are by poses of the variables, shape (N, 2)."""
+        flat = np.column_stack((self.arms, np.zeros(len(self.arms))))
+        return np.asarray(se2.compose(poses[self.variables], flat)[:, :2])
+
+    def solved(self, graph: PoseGraph, poses: FloatArray, counts: NDArray[np.bool_] | None = None) -> FloatArray:
+        """The poses that the graph and the positions give, linearized at ``poses``; None: all of them count."""
+        levers = self.points(poses) - poses[self.variables, :2]
+        jacobians = np.zeros((len(levers), 2, 3))
+        jacobians[:, :, :2], jacobians[:, :, 2] = np.eye(2), np.column_stack((-levers[:, 1], levers[:, 0]))
+        information = jacobians.swapaxes(1, 2) @ jacobians / self.sigma_m[:, None, None] ** 2
+        information[:, 2, 2] += _HEADING_INFORMATION  # the solver needs some
+        measured = np.column_stack((self.xy - levers, poses[self.variables, 2]))
+        rows = range(len(levers)) if counts is None else np.flatnonzero(counts).tolist()
+        priors = [PosePrior(int(self.variables[row]), measured[row], information[row]) for row in rows]
+        return optimize_anchored(graph, poses, priors)
 
 
 def _variables(robots: Sequence[MappedRobot]) -> FloatArray:

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from pydantic import Field, NonNegativeInt, ValidationError
 
-from fcslam.anchoring.part import LEAST_SIGMA_M, ROUNDS, MapPart, position_prior
+from fcslam.anchoring.part import LEAST_SIGMA_M, ROUNDS, MapPart, Positions
 from fcslam.cloud.result import MappedRobot
 from fcslam.config import StrictModel, one_line, parse_yaml
 from fcslam.errors import SourceError
@@ -21,7 +21,6 @@ from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
 from fcslam.graph.cluster import DIRECTION_M
 from fcslam.graph.consistency import TAG_VIEWS
-from fcslam.graph.optimizer import optimize_anchored
 from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import FloatArray, Tag, TagFamily, TagSighting
 from fcslam.untrusted import MOST_TEXT_BYTES, read_text
@@ -122,9 +121,8 @@ class MapTags:
 
     def _mean(self, sightings: Sequence[TagSighting]) -> _Place:
         poses = np.array([self._pose(one) for one in sightings])
-        covariances = np.array([np.linalg.inv(one.information) for one in sightings])
-        variances, turns = covariances[:, :2, :2].trace(axis1=1, axis2=2) / 2.0, covariances[:, 2, 2]
-        xy = np.average(poses[:, :2], axis=0, weights=1.0 / variances)
+        turns = np.array([np.linalg.inv(one.information)[2, 2] for one in sightings])
+        xy = np.average(poses[:, :2], axis=0, weights=[1.0 / _variance(one) for one in sightings])
         heading = np.arctan2(*((np.sin(poses[:, 2]) / turns).sum(), (np.cos(poses[:, 2]) / turns).sum()))
         return _Place(np.append(xy, heading), tuple(sightings))
 
@@ -178,7 +176,7 @@ class MapTags:
         without the part that another position of the tag explains."""
         bases = np.array([self._robots[one.id.robot].T_map_base[one.id.number, :2] for one in seen])
         ends = np.array([self._pose(one)[:2] for one in seen])
-        weights = np.array([2.0 / np.linalg.inv(one.information)[:2, :2].trace() for one in seen])
+        weights = np.array([1.0 / _variance(one) for one in seen])
         arms = ends - bases
         arms = arms - np.average(arms, axis=0, weights=weights)
         off = ends - np.average(ends, axis=0, weights=weights)
@@ -278,17 +276,21 @@ def _solve(graph: PoseGraph, poses: FloatArray, tags: MapTags, used: Sequence[Ta
     """Solve with the positions of surveyed tags; all sightings of a tag count as one measurement."""
     if len(used) < 2:
         return poses
-    seen = {tag: tags.places[tag][0].sightings for tag in used}
+    seen = [(one, len(place.sightings)) for place in (tags.places[tag][0] for tag in used) for one in place.sightings]
+    positions = Positions(
+        np.array([tags.variable(one) for one, _ in seen]),
+        np.array([one.T_base_tag[:2] for one, _ in seen]),
+        np.array([survey[one.tag][:2] for one, _ in seen]),
+        np.array([((_variance(one) + LEAST_SIGMA_M**2) * count) ** 0.5 for one, count in seen]),
+    )
     for _ in range(ROUNDS):
-        priors = []
-        for one in (one for tag in used for one in seen[tag]):
-            variable = tags.variable(one)
-            arm = se2.compose(np.array((0.0, 0.0, poses[variable, 2])), one.T_base_tag)[:2]
-            variance = np.linalg.inv(one.information)[:2, :2].trace() / 2.0 + LEAST_SIGMA_M**2
-            weight = 1.0 / (variance * len(seen[one.tag]))
-            priors.append(position_prior(variable, survey[one.tag][:2] - arm, poses[variable, 2], weight))
-        poses = optimize_anchored(graph, poses, priors)
+        poses = positions.solved(graph, poses)
     return poses
+
+
+def _variance(sighting: TagSighting) -> float:
+    """Mean variance of the position along both axes."""
+    return float(np.linalg.inv(sighting.information)[:2, :2].trace()) / 2.0
 
 
 def tag_lines(report: Mapping[str, Any]) -> Iterator[str]:

@@ -9,7 +9,7 @@ from fcslam.errors import InputError, PacketError
 from fcslam.records import CloudScan, LaserScan, SensorRecord
 from fcslam.sources import Source
 from fcslam.sources.faults import Faults
-from fcslam.sources.source import WHOLE, ScanRange, Survey
+from fcslam.sources.source import Survey
 from fcslam.wire.checks import check_floor
 
 
@@ -30,14 +30,14 @@ class OnFloors:
         """See ``Source``."""
         return self._source.faults
 
-    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+    def survey(self) -> Survey:
         """See ``Source``."""
-        return self._source.survey(scans)
+        return self._source.survey()
 
-    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+    def records(self) -> Iterator[SensorRecord]:
         """See ``Source``; the first scan on each floor names it."""
         first_s, coming = math.nan, sorted(self._floors.items(), reverse=True)
-        for record in self._source.records(scans):
+        for record in self._source.records():
             floor = ""
             if isinstance(record, LaserScan | CloudScan):
                 first_s = record.stamp if math.isnan(first_s) else first_s

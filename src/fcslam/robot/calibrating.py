@@ -27,7 +27,7 @@ from fcslam.sources.formats import bag_of
 from fcslam.sources.motion import OdometryUpdates
 from fcslam.sources.pose import pose_of
 from fcslam.sources.returns import FloorLine
-from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
+from fcslam.sources.source import Source, Survey
 
 if TYPE_CHECKING:
     from fcslam.sources.bags.rosbag import RosBag
@@ -247,14 +247,14 @@ class Noted:
         """As in Source."""
         return self._source.faults
 
-    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+    def survey(self) -> Survey:
         """As in Source."""
-        survey = self._source.survey(scans)
+        survey = self._source.survey()
         return replace(survey, notes=(*survey.notes, *self._notes))
 
-    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+    def records(self) -> Iterator[SensorRecord]:
         """As in Source."""
-        return self._source.records(scans)
+        return self._source.records()
 
 
 def calibrated(source: Source, config: LidarConfig) -> Source:

@@ -4,17 +4,15 @@ from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.writer import BAG_SUFFIXES, write_bag
 from fcslam.sources.faults import Fault, FaultCount, Faults
 from fcslam.sources.formats import IN_PLANE, check_copies, open_fleet, open_source, planar_note, whole_clouds
-from fcslam.sources.source import WHOLE, ScanRange, Source, Survey, split
+from fcslam.sources.source import Source, Survey, split
 
 __all__ = [
     "BAG_SUFFIXES",
     "IN_PLANE",
-    "WHOLE",
     "BagOptions",
     "Fault",
     "FaultCount",
     "Faults",
-    "ScanRange",
     "Source",
     "Survey",
     "check_copies",

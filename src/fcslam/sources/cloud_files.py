@@ -22,7 +22,7 @@ from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.logs.archive import translate_errors
 from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud
-from fcslam.sources.source import WHOLE, ScanRange, Survey
+from fcslam.sources.source import Survey
 from fcslam.untrusted import read_bytes, read_text
 
 SUFFIXES: Final = (".bin", ".pcd", ".ply")
@@ -89,12 +89,11 @@ class CloudFolder(CloudRecording):
     def _cloud(self, number: int) -> PointCloud:
         return read_cloud(self._files[number], self._stamps[number])
 
-    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+    def survey(self) -> Survey:
         """As in ``CloudRecording``."""
         _, notes = self._reader
-        stamps = self._stamps[scans.first : scans.end]
-        duration_s = stamps[-1] - stamps[0] if stamps else 0.0
-        return Survey(len(stamps), duration_s, 0.0, (BAND_LASER,), self._audit.faults(), notes)
+        stamps = self._stamps
+        return Survey(len(stamps), stamps[-1] - stamps[0], 0.0, (BAND_LASER,), self._audit.faults(), notes)
 
     def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:
         (reader, _), nothing = self._reader, np.zeros((0, 7))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fcslam.errors import SourceError
 from fcslam.records import CloudScan, FloatArray, LaserModel, SensorRecord, frozen
 from fcslam.sources.faults import Audit, Faults
-from fcslam.sources.gate import check_consistency, scan_window
+from fcslam.sources.gate import check_consistency
 from fcslam.sources.point_clouds import (
     DIRECTIONS,
     FARTHEST_M,
@@ -25,7 +25,7 @@ from fcslam.sources.point_clouds import (
     turn_of,
     unit_problem,
 )
-from fcslam.sources.source import WHOLE, ScanRange, Survey
+from fcslam.sources.source import Survey
 
 BAND_LASER: Final = LaserModel(DIRECTIONS // 2, -np.pi, 2.0 * tau / DIRECTIONS, FARTHEST_M)
 """The 2D laser in ``base`` that a 3D LiDAR stands for."""
@@ -62,22 +62,21 @@ class CloudRecording(ABC):
         return self._audit.faults()
 
     @abstractmethod
-    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+    def survey(self) -> Survey:
         """As in Source; clouds are counted, and not decoded."""
 
     @abstractmethod
     def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:
         """All clouds with their numbers; ``audit`` counts the faults."""
 
-    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+    def records(self) -> Iterator[SensorRecord]:
         """As in Source; every cloud carries the readings of the other sensors."""
         audit = self._audit = Audit(self._unit)
         count = 0
-        for _, scan in scan_window(self._scans(audit), scans, lambda _: True, audit):
+        for _, scan in self._scans(audit):
             count += 1
             yield scan
-        if scans == WHOLE:
-            check_consistency(self.path, audit.faults(), count, count)
+        check_consistency(self.path, audit.faults(), count, count)
 
 
 @dataclass(frozen=True)

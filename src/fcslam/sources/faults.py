@@ -60,6 +60,14 @@ class Faults:
     def __bool__(self) -> bool:
         return bool(self.counts)
 
+    def since(self, before: "Faults") -> "Faults":
+        """These faults without those counted ``before``, after which the first of a kind is not known."""
+        found = {}
+        for kind, its in self.counts.items():
+            if count := its.count - before[kind].count:
+                found[kind] = FaultCount(count, 0 if kind in before.counts else its.first_line, its.largest_s)
+        return Faults(found, self.unit)
+
     def plus(self, kind: Fault, count: int) -> "Faults":
         """These faults and ``count`` more, found by the robot and not by the reader."""
         return Faults({**self.counts, kind: FaultCount(self[kind].count + count)}, self.unit) if count else self
@@ -85,10 +93,6 @@ class Audit:
         """Add ``count`` faults at ``line``."""
         before = self._counts.get(kind, FaultCount(first_line=line))
         self._counts[kind] = FaultCount(before.count + count, before.first_line, max(before.largest_s, step_s))
-
-    def clear(self) -> None:
-        """Reset all counts."""
-        self._counts.clear()
 
     def faults(self) -> Faults:
         """The faults counted so far."""

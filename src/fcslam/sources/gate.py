@@ -11,16 +11,14 @@
 - Equal stamps are kept. Some logs were printed with too few digits or without a clock.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from math import inf
 from pathlib import Path
-from typing import TypeVar
 
 from fcslam.errors import SourceError
 from fcslam.geometry.beams import misfit
 from fcslam.records import Beams
 from fcslam.sources.faults import FEWEST, Audit, Fault, Faults
-from fcslam.sources.source import WHOLE, ScanRange
 
 MAX_STEP_BACK_S = 2.0
 """Largest tolerated step back in time; the messages of one clock are recorded within it of each other's delay."""
@@ -28,8 +26,6 @@ TOLERATED_SHARE = 0.01
 """Largest share of inconsistent scans in a recording."""
 FIRST_MESSAGES = 20
 """Number of first messages that decide what a sensor is, as which beams a laser has."""
-
-Entry = TypeVar("Entry")
 
 
 def usual_beams(scans: Sequence[Beams]) -> Beams:
@@ -77,28 +73,6 @@ class ScanGate:
         self._misplaced.clear()
         self._before_s = self._before_s[1], stamp
         return True
-
-
-def scan_window(
-    entries: Iterable[tuple[int, Entry]], scans: ScanRange, is_scan: Callable[[Entry], bool], audit: Audit
-) -> Iterator[tuple[int, Entry]]:
-    """Select the entries of a range of scans; other entries belong to the scan before them.
-
-    Afterwards, ``audit`` holds the faults of this range only.
-    """
-    if scans == WHOLE:
-        yield from entries
-        return
-    seen = 0
-    for number, entry in entries:
-        if is_scan(entry):
-            if scans.end is not None and seen >= scans.end:
-                return
-            if seen == scans.first > 0:
-                audit.clear()
-            seen += 1
-        if seen > scans.first or scans.first == 0:
-            yield number, entry
 
 
 def check_consistency(path: Path, faults: Faults, scan_count: int, odometry_count: int, first_errors: str = "") -> None:

@@ -3,23 +3,15 @@
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from itertools import islice, pairwise
+from math import isnan
+from typing import Protocol
 
 from fcslam.errors import SourceError
 from fcslam.records import CameraModel, CloudScan, GnssFix, LaserModel, LaserScan, SensorRecord, frozen
 from fcslam.sources.faults import Faults
-from fcslam.sources.pose import Pose, relative_pose
-
-
-class ScanRange(NamedTuple):
-    """Scans ``first`` (included) to ``end`` (excluded) of a recording, counted from 0 in file order."""
-
-    first: int = 0
-    end: int | None = None
-    """None: to the end of the recording."""
-
-
-WHOLE = ScanRange()
+from fcslam.sources.path_summary import PathSummary
+from fcslam.sources.pose import UNKNOWN_POSE, pose_of, relative_pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +45,14 @@ class Source(Protocol):
     def faults(self) -> Faults:
         """Faults of the latest pass of ``records`` so far; complete when the pass has ended."""
 
-    def survey(self, scans: ScanRange = WHOLE) -> Survey:
-        """Summarise ``scans`` in one quick pass.
+    def survey(self) -> Survey:
+        """Summarise the recording in one quick pass.
 
         Raises:
             SourceError: the recording is damaged, or cannot be mapped.
         """
 
-    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+    def records(self) -> Iterator[SensorRecord]:
         """Stream scans, odometry and images in file order; other records belong to the scan before them.
 
         A log is in memory as arrays meanwhile; of a bag, memory does not depend on its length. Every call starts a new
@@ -79,43 +71,58 @@ def split(source: Source, parts: int) -> list[Source]:
     count = source.survey().scan_count
     if not 1 <= parts <= count:
         raise SourceError(f"{source.name}: {count} scans cannot be cut into {parts} parts; choose 1 to {count}")
-    bounds = [count * number // parts for number in range(parts)]
-    ends = [*bounds[1:], None]
-    ranges = map(ScanRange, bounds, ends)
-    return [Part(source, scans, f"{source.name}_{number}") for number, scans in enumerate(ranges, start=1)]
+    bounds = [count * number // parts for number in range(parts + 1)]
+    return [
+        Part(source, first, end - first, f"{source.name}_{number}")
+        for number, (first, end) in enumerate(pairwise(bounds), start=1)
+    ]
 
 
 class Part:
-    """A range of scans of a recording as a robot of its own."""
+    """``count`` scans of a recording, from its scan ``first`` on, as a robot of its own."""
 
-    def __init__(self, whole: Source, scans: ScanRange, name: str) -> None:
+    def __init__(self, whole: Source, first: int, count: int, name: str) -> None:
         self._whole = copy(whole)
         """A copy with its own pass, because parts are read concurrently."""
-        self._scans = scans
+        self._first, self._count = first, count
+        self._before = Faults({})
+        """Those of the scans before."""
         self.name = name
 
     @property
     def faults(self) -> Faults:
         """As in Source, of this part only."""
-        return self._whole.faults
+        return self._whole.faults.since(self._before)
 
-    def survey(self, scans: ScanRange = WHOLE) -> Survey:
-        """As in Source; scans are counted from the part's first."""
-        return self._whole.survey(self._within(scans))
+    def survey(self) -> Survey:
+        """As in Source."""
+        track = PathSummary()
+        for scan in islice((each for each in self.records() if isinstance(each, LaserScan | CloudScan)), self._count):
+            pose = pose_of(scan.T_odom_base)
+            track.add(scan.stamp, UNKNOWN_POSE if isnan(pose[0]) else pose)
+        return replace(
+            self._whole.survey(),
+            scan_count=track.count,
+            duration_s=track.duration_s,
+            path_length_m=track.length_m,
+            faults=self.faults,
+        )
 
-    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
-        """As in Source; the first record is a scan at the identity, and records before it are dropped."""
-        origin: Pose | None = None
-        for record in self._whole.records(self._within(scans)):
-            if isinstance(record, GnssFix | CloudScan):
-                yield record
+    def records(self) -> Iterator[SensorRecord]:
+        """As in Source; the first record is a scan at the identity, and others belong to the scan before them."""
+        origin, seen = UNKNOWN_POSE, 0
+        self._before = Faults({})
+        for record in self._whole.records():
+            if isinstance(record, LaserScan | CloudScan):
+                if seen == self._first + self._count:
+                    return
+                if seen == self._first:
+                    self._before = self._whole.faults if seen else self._before
+                    origin = pose_of(record.T_odom_base)
+                seen += 1
+            if seen <= self._first:
                 continue
-            pose: Pose | None = None if record.T_odom_base is None else tuple(record.T_odom_base.tolist())
-            if origin is None and isinstance(record, LaserScan):
-                origin = pose
-            if origin is not None:
-                yield record if pose is None else replace(record, T_odom_base=frozen(relative_pose(origin, pose)))
-
-    def _within(self, scans: ScanRange) -> ScanRange:
-        ends = [self._scans.end] if scans.end is None else [self._scans.end, self._scans.first + scans.end]
-        return ScanRange(self._scans.first + scans.first, min((end for end in ends if end is not None), default=None))
+            if isinstance(record, GnssFix | CloudScan) or record.T_odom_base is None:
+                yield record
+            else:
+                yield replace(record, T_odom_base=frozen(relative_pose(origin, pose_of(record.T_odom_base))))

@@ -16,7 +16,7 @@ from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, CloudRecording
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.path_summary import PathSummary
-from fcslam.sources.source import WHOLE, ScanRange, Source, Survey
+from fcslam.sources.source import Source, Survey
 
 
 class CloudBag(CloudRecording):
@@ -35,7 +35,7 @@ class CloudBag(CloudRecording):
     def _reader(self) -> tuple[CloudReader, tuple[str, ...]]:
         return self._plan.scans.whole_reader(self._topic)
 
-    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+    def survey(self) -> Survey:
         """As in ``CloudRecording``."""
         _, notes = self._reader
         plan, track = self._plan, PathSummary()
@@ -44,11 +44,9 @@ class CloudBag(CloudRecording):
             for reading in chain.from_iterable(readings):
                 track.add(reading.stamp, reading.T_odom_base)
         first_ns, last_ns = self._bag.bag.census[self._topic].span_ns
-        count = len(range(self._topic.message_count)[scans.first : scans.end])
-        share = count / max(self._topic.message_count, 1)
         notes = (*self._bag.bag.notes, *notes, *self._bag.robot.notes, *plan.scans.notes, *plan.notes)
-        faults = self._audit.faults()
-        return Survey(count, share * (last_ns - first_ns) * 1e-9, share * track.length_m, (BAND_LASER,), faults, notes)
+        count, duration_s = self._topic.message_count, (last_ns - first_ns) * 1e-9
+        return Survey(count, duration_s, track.length_m, (BAND_LASER,), self._audit.faults(), notes)
 
     def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:
         plan, (reader, _) = self._plan, self._reader

@@ -20,7 +20,7 @@ from fcslam.sources.bags.container import is_transforms
 from fcslam.sources.bags.imu import ImuReading
 from fcslam.sources.bags.messages import OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
-from fcslam.sources.bags.pairing import Entry, PosedScan
+from fcslam.sources.bags.pairing import PosedScan
 from fcslam.sources.bags.plan import EACH_LASER, BagPlan, plan_of
 from fcslam.sources.bags.reader import Numbered, SensorReader
 from fcslam.sources.bags.rig import Rig
@@ -28,10 +28,10 @@ from fcslam.sources.bags.robots import BagRobot, robot_of, robots_of, slashed
 from fcslam.sources.bags.transforms import NoTransformError
 from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
-from fcslam.sources.gate import check_consistency, scan_window
+from fcslam.sources.gate import check_consistency
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.returns import RangeSample, placeholder_note, without
-from fcslam.sources.source import WHOLE, ScanRange, Survey
+from fcslam.sources.source import Survey
 
 _audit = partial(Audit, "message")
 _OF_SCANS = "its range_min and range_max"
@@ -106,20 +106,11 @@ class RosBag:
         """As in Source."""
         return self._audit.faults()
 
-    def survey(self, scans: ScanRange = WHOLE) -> Survey:
-        """As in Source; the pass over the whole bag is made once."""
-        whole = self._reading.survey
-        if scans == WHOLE:
-            return whole
-        audit, track = _audit(), PathSummary()
-        for _, entry in scan_window(self._entries(audit), scans, _is_scan, audit):
-            if isinstance(entry, PosedScan):
-                track.add(entry.scan.stamp, entry.T_odom_base)
-        return Survey(
-            track.count, track.duration_s, track.length_m, whole.lasers, audit.faults(), whole.notes, whole.camera
-        )
+    def survey(self) -> Survey:
+        """As in Source; the pass over the bag is made once."""
+        return self._reading.survey
 
-    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+    def records(self) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = _audit()
         watch = ScanWatch(audit)
@@ -130,8 +121,7 @@ class RosBag:
         fixes = deque(found)
         for kind, fault in faults.counts.items():
             audit.add(kind, fault.first_line, fault.count)
-        entries = self._entries(audit, with_images=rig.camera is not None, imu=self._imu)
-        for number, entry in scan_window(entries, scans, _is_scan, audit):
+        for number, entry in self._entries(audit, with_images=rig.camera is not None, imu=self._imu):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
                 while fixes and fixes[0].stamp <= record.stamp:
@@ -284,10 +274,6 @@ class RosBag:
             options = replace(options, scan_topics=topics, laser_poses=poses)
         called = "_".join(filter(None, (name, robot.name.strip("/").replace("/", "_")))) or self.name
         return RosBag(self.path, called, options, self._notes, robot)
-
-
-def _is_scan(entry: Entry) -> bool:
-    return isinstance(entry, PosedScan)
 
 
 def _in_brackets(errors: Mapping[str, str]) -> str:

@@ -16,13 +16,13 @@ from fcslam.errors import SourceError
 from fcslam.records import Beams, FloatArray, LaserScan, Odometry, SensorRecord, frozen
 from fcslam.sources.contradictions import ScanWatch
 from fcslam.sources.faults import Audit, Fault, Faults
-from fcslam.sources.gate import FIRST_MESSAGES, ScanGate, check_consistency, scan_window
+from fcslam.sources.gate import FIRST_MESSAGES, ScanGate, check_consistency
 from fcslam.sources.logs.carmen import BROKEN, SICK_MAX_RANGE_M, CarmenArrays
 from fcslam.sources.logs.laser import laser_model, usual_log_beams
 from fcslam.sources.path_summary import PathSummary, without_odometry
 from fcslam.sources.pose import UNKNOWN_POSE, pose_of
 from fcslam.sources.returns import RangeSample, placeholder_note, without
-from fcslam.sources.source import WHOLE, ScanRange, Survey
+from fcslam.sources.source import Survey
 
 _Entry = tuple[int, FloatArray]
 """A scan or a reading of the odometry, counted as in ``CarmenArrays.contents``, and T_odom_base."""
@@ -49,26 +49,22 @@ class CarmenLog:
         """As in Source."""
         return self._audit.faults()
 
-    def survey(self, scans: ScanRange = WHOLE) -> Survey:
+    def survey(self) -> Survey:
         """As in Source."""
-        if scans == WHOLE:
-            return self._reading.survey
-        audit, track = Audit(), PathSummary()
-        for _, (k, T_odom_base) in self._entries(scans, audit):
-            if k >= 0:
-                track.add(self._log.stamps[k], pose_of(T_odom_base))
-        return Survey(track.count, track.duration_s, track.length_m, self._reading.survey.lasers, audit.faults())
+        return self._reading.survey
 
-    def records(self, scans: ScanRange = WHOLE) -> Iterator[SensorRecord]:
+    def records(self) -> Iterator[SensorRecord]:
         """As in Source."""
         audit = self._audit = Audit()
         watch, log, reading = ScanWatch(audit), self._log, self._reading
         (laser,) = reading.survey.lasers
-        for number, (k, T_odom_base) in self._entries(scans, audit):
+        for number, (k, T_odom_base) in self._posed(audit):
             if k < 0:
                 if reading.has_odometry:
                     yield Odometry(log.odometry_stamps[~k], T_odom_base)
                 continue
+            if k in log.untimed:
+                audit.add(Fault.NO_STAMP, number)
             ranges_m = log.ranges_m[k]
             if invalid := log.invalid.get(k):
                 audit.add(Fault.INVALID_RANGE, number, invalid)
@@ -131,14 +127,8 @@ class CarmenLog:
         )
         return _Reading(survey, pose_from_odometry, driven.fault is None, placeholders)
 
-    def _entries(self, scans: ScanRange, audit: Audit) -> Iterator[tuple[int, _Entry]]:
-        """Lines with consistent scans, and with the readings of the odometry among them."""
-        for number, entry in scan_window(self._posed(audit), scans, lambda entry: entry[0] >= 0, audit):
-            if entry[0] in self._log.untimed:
-                audit.add(Fault.NO_STAMP, number)
-            yield number, entry
-
     def _posed(self, audit: Audit) -> Iterator[tuple[int, _Entry]]:
+        """Lines with consistent scans, and with the readings of the odometry among them."""
         log, reading = self._log, self._reading
         unknown: FloatArray = frozen(UNKNOWN_POSE)
         latest: FloatArray | None = None
