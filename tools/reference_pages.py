@@ -51,8 +51,8 @@ A running service answers these HTTP requests for its state, maps and edits. `ma
 | 400 | the request is invalid |
 | 401 | the token is unknown |
 | 403 | the role or the robot does not match |
-| 404 | there is no such thing |
-| 409 | two agents with one name, two packets with one number, a mission that exists, or an edit that cannot be undone |
+| 404 | the requested item does not exist |
+| 409 | two processes with one robot name, two packets with one number, an existing mission, or a final edit |
 | 413 | the request exceeds 1 MiB |
 | 429 | too many requests; `Retry-After` says when to try again |
 | 503 | the service is stopping, or it is not ready |

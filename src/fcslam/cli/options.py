@@ -41,7 +41,7 @@ ConfigFiles = Annotated[
         "-c",
         metavar="FILE|KEY=VALUE",
         help="Configuration file (YAML; `fcslam tools config` prints the default one), one key of it, such as "
-        "fleet.join_maps=false, or the preset `paper`: FC-SLAM to the letter. Can be repeated; a later one overrides "
+        "fleet.join_maps=false, or the preset `paper`: FC-SLAM as published. Can be repeated; a later one overrides "
         "keys of an earlier one.",
     ),
 ]

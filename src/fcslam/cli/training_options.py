@@ -32,8 +32,8 @@ Learn = Annotated[
     typer.Option(
         "--learn",
         rich_help_panel="Learning",
-        help="Train the detector with the fleet on what the camera saw again: after a recording, and while a live "
-        "robot stands still. No image leaves. Settings: learning.yaml in --state.",
+        help="Train the detector with the fleet on places that the camera saw again: after a recording, and while a "
+        "live robot stands still. No image leaves. Settings: learning.yaml in --state.",
     ),
 ]
 

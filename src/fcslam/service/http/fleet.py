@@ -66,7 +66,7 @@ def fleet_router(state: ViewerState) -> APIRouter:
 
     @router.get("/fleet")
     def get_fleet(request: Request) -> FleetSummary:
-        """Counts."""
+        """State of the mission: counts, age and backlog of the map, free disk space."""
         mission = state.mission
         run, counts, folder = run_of(mission), mission.packet_counts(), mission.run_folder
         is_live = folder is not None and not state.read_only
@@ -121,7 +121,7 @@ def fleet_router(state: ViewerState) -> APIRouter:
 
     @router.get(f"{_CLOSURE}.png", **file_of("image/png", refused=(400, 404)))
     def get_closure_picture(closure: Annotated[ClosureRow, Depends(closure_of)]) -> Response:
-        """Walls around both ends of a closure, laid on each other as it measured them."""
+        """Picture of the walls around both ends of a closure, overlaid by its measured pose."""
         try:
             picture = overlay_png(state.mission.store, run_of(state.mission), closure)
         except StoreError:
@@ -132,7 +132,7 @@ def fleet_router(state: ViewerState) -> APIRouter:
 
     @router.get(_CLOSURE, responses=refusals(400, 404))
     def get_closure(closure: Annotated[ClosureRow, Depends(closure_of)]) -> ClosureSummary:
-        """One closure as it is now."""
+        """The present state of one closure."""
         return _closure_summary(closure)
 
     @router.get("/robots/{robot}/scans/{epoch}", responses=refusals(400, 404))
@@ -143,7 +143,7 @@ def fleet_router(state: ViewerState) -> APIRouter:
 
     @router.get("/edits")
     def get_edits() -> list[EditSummary]:
-        """All edits, and what undid them."""
+        """All edits, and the edits that undid them."""
         edits = state.mission.store.edits()
         gone = undone(edits)
         return [edit_summary(edit, gone.get(edit.number)) for edit in edits]

@@ -66,7 +66,7 @@ def joint_map_router(state: ServiceState) -> APIRouter:
         openapi_extra=json_body(OwnPose),
     )
     async def exchange_poses(request: Request, robot: Name) -> FleetReply:
-        """Say where a robot is, and read where all robots are."""
+        """Send the pose of a robot, and get the poses of all robots."""
         return await run_in_threadpool(exchange, robot, await read_json(request, OwnPose))
 
     def exchange(robot: str, own: OwnPose) -> FleetReply:
@@ -128,7 +128,7 @@ def joint_map_router(state: ServiceState) -> APIRouter:
 
     @router.get("/frontiers", dependencies=as_reader)
     def get_frontiers(robot: Annotated[str | None, Query(pattern=f"^{NAME.pattern}$")] = None) -> list[MapFrontiers]:
-        """Where each map can be explored further, and which robot shall go where; made anew about every five seconds.
+        """The frontiers of each map and the robot that has each; updated about every five seconds.
 
         With ``robot``, only the map that this robot is in, and only its distances.
         """
@@ -142,7 +142,7 @@ def joint_map_router(state: ServiceState) -> APIRouter:
 
     @router.get("/quality", dependencies=as_reader)
     def get_quality(robot: Annotated[str | None, Query(pattern=f"^{NAME.pattern}$")] = None) -> list[QualityReply]:
-        """How good each map is, about half a minute old; with ``robot``, only the map that this robot is in."""
+        """Verdict and certificate of each map, up to half a minute old; with ``robot``, only of the map it is in."""
         folder = state.mission.run_folder
         return [] if folder is None else [one for one in _qualities(folder) if one.map_index in _maps_of(folder, robot)]
 

@@ -103,15 +103,15 @@ def map_router(state: ViewerState) -> APIRouter:
     def get_map(
         request: Request, k: Index, suffix: Annotated[str, PathParameter(pattern="^(png|pgm|yaml|svg|tif|zip|ply)$")]
     ) -> Response:
-        """A map: picture, occupancy, what map_server needs to know of it, both in one archive, drawing, GeoTIFF if its
-        place on earth is known, and points in space if robots with 3D LiDARs made it.
+        """A map: png (picture), pgm and yaml (for map_server), zip (both), svg (in metres), tif (GeoTIFF, if the map is
+        georeferenced), ply (points, if robots with 3D LiDARs made it).
         """
         if suffix in ("svg", "tif", "zip"):
             content = export_map(_folder_of(state), k, suffix)
         else:
             content = read_bytes(_existing(state, f"{map_stem(k)}.{suffix}"))
         if content is None:
-            raise HTTPException(404, f"there is no {map_stem(k)}, or its place on earth is not known")
+            raise HTTPException(404, f"there is no {map_stem(k)}, or it is not georeferenced")
         return unless_known(request, content, MEDIA[suffix])
 
     @router.get("/maps/{k}/tiles/{z}/{x}/{y}.png", **file_of(MEDIA["png"], refused=(400, 404), is_tagged=True))

@@ -47,7 +47,7 @@ class RobotState(StrictModel):
 
 
 class FleetSummary(StrictModel):
-    """Counts."""
+    """State of the mission."""
 
     mission: str
     version: str = Field(description="of fcslam; a page of another version must be loaded again")
