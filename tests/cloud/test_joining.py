@@ -69,7 +69,7 @@ def test_the_verdict_is_the_same_from_both_sides(turned):
     for robots in (("a", "b"), ("b", "a")):
         verdict = decide_join(evidence, robots, graph, SETTINGS, unexamined)
         assert verdict.members == (0, 1, 2, 3)
-        assert verdict.runner_up == (4, 5)
+        assert verdict.evidence.rival_closures == 2
         assert verdict.dominant
         assert not verdict.contested
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from fcslam.cloud.recognition import Visit, visits_near, worth_comparing
+from fcslam.cloud.recognition import visits_near, worth_comparing
 from fcslam.records import KeyscanId
 
 OF_EACH, MOST = 2, 3
 
 
 def visit(robot, number, distance_m):
-    return Visit(distance_m, KeyscanId(robot, number))
+    return distance_m, KeyscanId(robot, number)
 
 
 @pytest.mark.parametrize("robots", [1, 2, 3, 8, 30])
@@ -21,7 +21,7 @@ def test_more_robots_cost_no_more_than_a_few(robots):
     ]
     chosen = worth_comparing(visits, OF_EACH, MOST)
     assert len(chosen) == min(MOST, OF_EACH * robots)
-    assert chosen[0] == min((each for found in visits for each in found), key=lambda each: each.distance_m)
+    assert chosen[0] == min(each for found in visits for each in found)
 
 
 def test_the_nearest_visits_of_different_robots_come_first():
@@ -32,9 +32,9 @@ def test_the_nearest_visits_of_different_robots_come_first():
 def test_consecutive_places_are_one_visit():
     poses = np.array([(0, 0, 0), (1, 0, 0), (20, 0, 0), (2, 0, 0), (0.5, 0, 0), (30, 0, 0)], float)
     found = visits_near("a", np.arange(6), poses, np.zeros(2), 5.0)
-    assert [each.nearest.number for each in found] == [0, 4]
+    assert [nearest.number for _, nearest in found] == [0, 4]
 
 
 def test_a_place_above_another_is_not_near():
     poses = np.array([(0, 0, 0, 0, 0, 0, 1), (1, 0, 3.2, 0, 0, 0, 1)], float)
-    assert [each.nearest.number for each in visits_near("a", np.arange(2), poses, np.zeros(3), 3.0)] == [0]
+    assert [nearest.number for _, nearest in visits_near("a", np.arange(2), poses, np.zeros(3), 3.0)] == [0]

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from fcslam.config import Settings
 from fcslam.errors import PacketError
-from fcslam.geometry.groups import SE2, SE3, group_of
+from fcslam.geometry.groups import SE3, group_of
 from fcslam.lidar.frontend import least_sigmas
 from fcslam.lidar.verification import CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
 from fcslam.records import Constraint, ConstraintKind, FloatArray, Place, TagSighting, VoxelMap, frozen
@@ -78,23 +78,12 @@ def with_least_noise(constraint: Constraint) -> Constraint:
     if constraint.kind is ConstraintKind.ODOMETRY:
         T = constraint.T_i_j
         sigma_m, sigma_rad = least_sigmas(float(group.shift_m(T)), float(group.turn_rad(T)))
-    if group is SE2 and _is_no_more(constraint.information, sigma_m, sigma_rad):
-        return constraint
     unit = group.sigmas(sigma_m, sigma_rad)
     eigenvalues, axes = np.linalg.eigh(constraint.information * np.outer(unit, unit))
+    if eigenvalues[-1] <= _ROUNDING:
+        return constraint
     information = (axes * np.minimum(eigenvalues, 1.0)) @ axes.T / np.outer(unit, unit)
     return replace(constraint, information=frozen(0.5 * (information + information.T)))
-
-
-def _is_no_more(information: FloatArray, sigma_m: float, sigma_rad: float) -> bool:
-    """Whether no eigenvalue of the information (3, 3) is above ``_ROUNDING``, in units of the least noise."""
-    (xx, xy, xt), (_, yy, yt), (_, _, tt) = information.tolist()  # without arrays
-    x, y, t = (_ROUNDING - scaled for scaled in (xx * sigma_m**2, yy * sigma_m**2, tt * sigma_rad**2))
-    xy, xt, yt = xy * sigma_m**2, xt * sigma_m * sigma_rad, yt * sigma_m * sigma_rad
-    if x > 0.0:
-        second, rest = y - xy * xy / x, yt + xy * xt / x
-        return bool(second > 0.0 and t - xt * xt / x - rest * rest / second > 0.0)
-    return False
 
 
 def check_distance(T_odom_base: FloatArray, robot: str, limits: ClaimLimits) -> None:

@@ -47,13 +47,13 @@ CONTESTED_GROWTH = 1.1
 """After a re-evaluation confirmed a contested join, the number of closures grows by this factor before the next one:
 the same evidence would be weighed again at every place."""
 
+PLACES_A_SESSION = 0.5
+"""Robots join after so many places for each session: a re-evaluation takes about as long as a place for each."""
 REFINED_KEYSCANS = 15
 """Scans before and after each end of a closure by hand whose walls refine it: a few metres of path."""
 DECIDED_GROWTH = 1.0 + SOLVED_SHARE
 """Sessions whose evidence fell short are decided again when it has grown by this factor, or in a re-evaluation. A
 decision tests every pair of closures: at each place, it would take longer than all else where robots meet for hours."""
-DECIDED_EACH_TIME = 100
-"""Up to this many closures, two sessions are decided at each new one."""
 
 Scans = Sequence[tuple[PointScan, FloatArray]]
 """Scans around a keyscan, and their poses (3,) in its base."""
@@ -73,6 +73,7 @@ class ClosureDecisions(Kept):
         "_joins": bool,
         "_contested": bool,
         "_evaluated": int,
+        "_waited": int,
     }
 
     def __init__(self, config: FleetConfig, sessions: SessionStore, graph: JointGraph, space: Space) -> None:
@@ -100,6 +101,8 @@ class ClosureDecisions(Kept):
         """Whether evidence has turned against a join."""
         self._evaluated = 0
         """Number of closures at the last re-evaluation."""
+        self._waited = 0
+        """How many places and sightings of tags came in since then."""
 
     def map_of(self, session: str) -> list[str]:
         """The sessions that share a map with this one, itself included."""
@@ -136,13 +139,16 @@ class ClosureDecisions(Kept):
     def optimize_if_due(self) -> None:
         """Solve the joint graph if enough closures are new; re-evaluate if evidence speaks for or against a join.
 
-        A re-evaluation takes as long as there are sessions, so robots that meet at the same time join together.
+        Called for each place. A re-evaluation takes as long as there are sessions, so it waits for as many closures and
+        for half as many places: robots that meet at the same time join together.
         """
+        self._waited += 1
         # The graph of a robot alone is solved once, at the end.
         if len(self._sessions.robots) > 1 and self._graph.is_due(self._config.solve_every):
             self._optimize()
         is_contested = self._contested and len(self.closures) >= int(CONTESTED_GROWTH * self._evaluated)
-        if is_contested or (self._joins and len(self.closures) >= self._evaluated + len(self._sessions.robots)):
+        sessions, new = len(self._sessions.robots), len(self.closures) - self._evaluated
+        if is_contested or (self._joins and new >= sessions and self._waited >= PLACES_A_SESSION * sessions):
             self.reevaluate()
 
     def edit(self, changes: Sequence[Change]) -> bool:
@@ -180,7 +186,7 @@ class ClosureDecisions(Kept):
         self.separated += _separated(self.maps, fusion.maps)
         self.maps, self.joins = [list(sessions) for sessions in fusion.maps], dict(fusion.joins)
         self._due.clear()
-        self._joins, self._contested, self._evaluated = False, False, len(self.closures)
+        self._joins, self._contested, self._evaluated, self._waited = False, False, len(self.closures), 0
         self.version += 1
         return fusion
 
@@ -273,8 +279,7 @@ class ClosureDecisions(Kept):
             _explain(entries, decision.shortfall.under(CONSISTENCY))
         else:
             self._joins |= any(entries[k].closure.status is not ClosureStatus.ACCEPTED for k in decision.members)
-        growth = DECIDED_GROWTH if len(entries) > DECIDED_EACH_TIME else 1.0
-        self._due[pair] = int(growth * len(entries)) + 1
+        self._due[pair] = int(DECIDED_GROWTH * len(entries)) + 1
 
     def _accept(self, entry: ClosureEntry, reason: Reason) -> None:
         closure = entry.closure

@@ -169,7 +169,6 @@ class JointGraph:
             "left_out": sorted(self._left_out),
             "unsolved": self._unsolved,
             "changed": sorted(self._changed),
-            "robots": list(self._variables),
             "paths": {
                 robot: {
                     "variables": variables.values,
@@ -187,8 +186,7 @@ class JointGraph:
         self._left_out, self._unsolved = set(state["left_out"]), state["unsolved"]
         self._changed = set(state["changed"])
         self._closures = int(state["edges"]["robust"].sum())
-        for robot in state["robots"]:
-            path = state["paths"][robot]
+        for robot, path in state["paths"].items():
             self._variables[robot] = Rows(path["variables"])
             self._chains[robot], self._step_covariance[robot] = Rows(path["chain"]), Rows(path["steps"])
 

@@ -1,7 +1,6 @@
 """Place recognition of the fleet: which stored places may a new one show again, and which are kept."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -46,12 +45,8 @@ COMPARED_VISITS = 3
 _NO_PLACES = np.empty((0, 2), np.int64)
 
 
-class Visit(NamedTuple):
-    """Consecutive places of one session near a point."""
-
-    distance_m: float
-    """Distance of the nearest one."""
-    nearest: KeyscanId
+Visit = tuple[float, KeyscanId]
+"""Consecutive places of one session near a point: the distance of the nearest one, metres, and that one."""
 
 
 class PlaceRecognition:
@@ -193,7 +188,7 @@ class PlaceRecognition:
                 visits.setdefault(robot_of(session), []).extend(found)
         chosen = worth_comparing(visits.values(), NEAR_VISITS, COMPARED_VISITS)
         group = self._graph.group
-        T_i_j = {visit.nearest: group.between(self._graph.pose(visit.nearest), pose) for visit in chosen}
+        T_i_j = {nearest: group.between(self._graph.pose(nearest), pose) for _, nearest in chosen}
         return {i: self._space.in_plane(T, i, place.id) for i, T in T_i_j.items()}
 
     def _by_start(self, place: Place, map_sessions: Collection[str]) -> Iterator[PlaceMatch]:
@@ -214,8 +209,8 @@ class PlaceRecognition:
             T_start_i = dict(zip(numbers.tolist(), self._from_start(session, numbers), strict=True))
             T_start_j = se2.compose(T_starts, T_start_place)
             visits = visits_near(session, numbers, np.array([*T_start_i.values()]), T_start_j[:2], SIGHT_M)
-            nearest = [visit.nearest for visit in sorted(visits, key=attrgetter("distance_m"))]
-            expected = {i: se2.between(T_start_i[i.number], T_start_j) for i in nearest[:NEAR_VISITS]}
+            nearest = sorted(visits)[:NEAR_VISITS]
+            expected = {i: se2.between(T_start_i[i.number], T_start_j) for _, i in nearest}
             for match in self._matcher(key).match_at(place, expected):
                 T_start_found = se2.compose(T_start_i[match.i.number], match.T_i_j)
                 off = se2.between(T_starts, se2.compose(T_start_found, se2.inverse(T_start_place)))
@@ -241,7 +236,7 @@ def visits_near(
     visits = []
     for stay in stays:
         nearest = stay[np.argmin(distance[stay])]
-        visits.append(Visit(float(distance[nearest]), KeyscanId(session, int(numbers[nearest]))))
+        visits.append((float(distance[nearest]), KeyscanId(session, int(numbers[nearest]))))
     return visits
 
 
@@ -251,6 +246,6 @@ def worth_comparing(visits: Iterable[Sequence[Visit]], of_each: int, most: int) 
     ``of_each`` robot and ``most`` in all are taken. Closures to a few robots determine the pose relative to all others
     that closures tie to them.
     """
-    nearest = (sorted(found, key=attrgetter("distance_m"))[:of_each] for found in visits)
+    nearest = (sorted(found)[:of_each] for found in visits)
     ranked = sorted((rank, visit) for found in nearest for rank, visit in enumerate(found))
     return [visit for _, visit in ranked[:most]]

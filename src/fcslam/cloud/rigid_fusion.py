@@ -23,6 +23,7 @@ from fcslam.cloud.result import Fusion
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment, two_point_alignment
 from fcslam.graph.evidence import DISTINCT_RAD
+from fcslam.graph.joint import merge
 from fcslam.records import ClosureStatus, FloatArray, LoopClosure, Reason, ReasonCode, frozen
 
 APART_M = 5.0
@@ -45,16 +46,18 @@ def fuse_rigidly(closures: Iterable[ClosureEntry], T_local_base: Mapping[str, Fl
     entries = list(closures)
     between = [entry for entry in entries if entry.is_between and not entry.vetoed]
     valid = [entry for entry in between if entry.closure.status is not ClosureStatus.CANDIDATE]
-    maps, frames = [[robot] for robot in T_local_base], {robot: np.zeros(3) for robot in T_local_base}
+    order = list(T_local_base)
+    frames, maps = [se2.IDENTITY for _ in order], list(range(len(order)))
     used: dict[ClosureEntry, Reason] = {}
     for robots, members in _links(valid, T_local_base).items():
         T_a_b = n_point_alignment(*np.stack([poses[:, :2] for _, poses in members], axis=1))
-        if np.isfinite(T_a_b).all() and _join(robots, T_a_b, maps, frames):
+        if np.isfinite(T_a_b).all() and merge(frames, maps, order.index(robots[0]), order.index(robots[1]), T_a_b):
             used |= {entry: Reason(ReasonCode.MATCHED_POINT, len(members)) for entry, _ in members}
     T_map_base: dict[str, FloatArray] = {
-        robot: frozen(se2.compose(frames[robot], poses)) for robot, poses in T_local_base.items()
+        robot: frozen(se2.compose(frame, T_local_base[robot])) for robot, frame in zip(order, frames, strict=True)
     }
-    return Fusion(maps, T_map_base, T_local_base, tuple(_closure(entry, used) for entry in entries))
+    shared = [[robot for robot, of in zip(order, maps, strict=True) if of == number] for number in sorted(set(maps))]
+    return Fusion(shared, T_map_base, T_local_base, tuple(_closure(entry, used) for entry in entries))
 
 
 def _links(
@@ -100,26 +103,6 @@ def _are_valid(poses: FloatArray, others: FloatArray) -> bool:
     line = np.arctan2(y_a, x_a) - np.arctan2(y_b, x_b)
     off = se2.wrap_angle(np.array([pair[0, 2] - pair[1, 2] - line for pair in (poses, others)]))
     return bool(np.abs(off).max() < DISTINCT_RAD)
-
-
-def _join(robots: tuple[str, str], T_a_b: FloatArray, maps: list[list[str]], frames: dict[str, FloatArray]) -> bool:
-    """Put the younger of two robots' maps into the older one's frame; False if they are one.
-
-    ``maps`` and ``frames`` (T_map_local of each robot) are changed.
-    """
-    map_a, map_b = (next(members for members in maps if robot in members) for robot in robots)
-    if map_a is map_b:
-        return False
-    T_older_younger = se2.compose(se2.compose(frames[robots[0]], T_a_b), se2.inverse(frames[robots[1]]))
-    older, younger = map_a, map_b
-    if maps.index(older) > maps.index(younger):
-        older, younger, T_older_younger = younger, older, se2.inverse(T_older_younger)
-    for robot in younger:
-        frames[robot] = se2.compose(T_older_younger, frames[robot])
-    maps.remove(younger)
-    older.extend(younger)
-    older.sort(key=list(frames).index)
-    return True
 
 
 def _closure(entry: ClosureEntry, used: Mapping[ClosureEntry, Reason]) -> LoopClosure:

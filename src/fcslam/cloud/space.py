@@ -5,6 +5,7 @@ The plane of a keyscan is its frame ``ground``: level, on the floor below its ba
 """
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -16,7 +17,7 @@ from fcslam.geometry.groups import SE2, SE3, Group
 from fcslam.lidar.scan import PointScan
 from fcslam.lidar.voxel_matching import PreparedMap, align_maps, disagreement, prepared, seen_through
 from fcslam.places.matcher import PlaceMatch
-from fcslam.records import ClosureStatus, Constraint, FloatArray, KeyscanId, Reason, ReasonCode, VoxelMap, frozen
+from fcslam.records import ClosureStatus, Constraint, FloatArray, KeyscanId, Reason, ReasonCode, frozen
 
 _FLOOR_M, _FLOOR_RAD = 0.05, 0.02
 """Standard deviations of height and inclination of a floor that two robots saw at one place."""
@@ -36,7 +37,7 @@ class Space:
 
     def __init__(self, group: Group, sessions: SessionStore) -> None:
         self.group, self._sessions = group, sessions
-        self._prepared: dict[KeyscanId, PreparedMap] = {}
+        self._ready = lru_cache(_KEPT)(self._prepared)
 
     def constraint(self, constraint: Constraint) -> Constraint:
         """A robot's constraint as one of the fleet's group."""
@@ -86,7 +87,7 @@ class Space:
         voxels_a, voxels_b = self._sessions.voxel_map(match.i), self._sessions.voxel_map(match.j)
         if not match.M or voxels_a is None or voxels_b is None:
             return lifted
-        a, b, guess = self._ready(voxels_a), self._ready(voxels_b), se3.from_plane(match.T_i_j)
+        a, b, guess = self._ready(match.i), self._ready(match.j), se3.from_plane(match.T_i_j)
         T_a_b, information = align_maps(a, b, guess)
         off = se3.between(guess, T_a_b)
         reason = _too_far(off) or disagreement(a, b, T_a_b, match.predicted)
@@ -119,7 +120,7 @@ class Space:
             nearest = int(np.argmin(SE3.shift_m(between)))
             T = between[nearest]
             if SE3.shift_m(T) < _SAME_PLACE_M:
-                maps = self._ready(a[nearest]), self._ready(new)
+                maps = self._ready(a[nearest].id), self._ready(new.id)
                 aligned, _ = align_maps(*maps, T)
                 T = T if _too_far(se3.between(T, aligned)) else aligned
                 counts.append(np.add(seen_through(*maps[::-1], T), seen_through(*maps, se3.inverse(T))))
@@ -140,16 +141,14 @@ class Space:
         turned = moved.T @ information @ moved
         return T_i_j, 0.5 * (turned + turned.T)
 
+    def _prepared(self, keyscan: KeyscanId) -> PreparedMap:
+        voxels = self._sessions.voxel_map(keyscan)
+        assert voxels is not None
+        return prepared(voxels)
+
     def _ground(self, keyscan: KeyscanId) -> FloatArray:
         voxels = self._sessions.voxel_map(keyscan)
         return se3.IDENTITY if voxels is None else voxels.T_base_ground
-
-    def _ready(self, voxels: VoxelMap) -> PreparedMap:
-        found = self._prepared.pop(voxels.id, None) or prepared(voxels)
-        while len(self._prepared) >= _KEPT:
-            del self._prepared[next(iter(self._prepared))]
-        self._prepared[voxels.id] = found
-        return found
 
 
 def _lifted(information: FloatArray, sigma_m: float, sigma_rad: float) -> FloatArray:

@@ -1,45 +1,36 @@
 """Submaps of places, built from keyscans on demand and cached."""
 
-from dataclasses import dataclass
 from typing import Final
 
 from fcslam.cloud.joint_graph import JointGraph
 from fcslam.cloud.space import Space
-from fcslam.lidar.scan import PointScan
-from fcslam.lidar.submap import Submap, build_submap, read_submap, self_violation, submap_bytes
-from fcslam.records import Channel, FloatArray, KeyscanId, Place
+from fcslam.lidar.submap import Located, Submap, build_submap, read_submap, self_violation, submap_bytes
+from fcslam.records import Channel, KeyscanId, Place
 
 UNPACKED: Final = 250
 """Submaps that are kept ready to compare, 0.2 MB each. To unpack one takes a tenth of the time to build it."""
-
-
-@dataclass(slots=True)
-class _Entry:
-    packed: bytes | None = None
-    noise: float | None = None
-
-
 _Key = tuple[KeyscanId, Channel]
 
 
 class SubmapCache:
-    """Holds up to ``capacity`` submaps, packed; the least recently used one is dropped first."""
+    """Holds the submaps used last, and up to ``capacity`` packed ones, of which the oldest is dropped first."""
 
     def __init__(self, graph: JointGraph, space: Space, capacity: int) -> None:
         self._graph = graph
         self._space = space
         self._capacity = capacity
-        self._entries: dict[_Key, _Entry] = {}
-        """The one used last is the last."""
         self._unpacked: dict[_Key, Submap] = {}
-        """The submaps of entries that were used last; the one used last is the last."""
+        """The one used last is the last."""
+        self._packed: dict[_Key, bytes] = {}
+        self._noise: dict[_Key, float] = {}
 
     def of(self, place: Place) -> Submap:
         """The submap around a place, in its keyscan's frame, by the robot's own motions."""
-        key = (place.id, place.channel)
-        entry, submap = self._entry(key), self._unpacked.pop(key, None)
+        key = place.id, place.channel
+        submap = self._unpacked.pop(key, None)
         if submap is None:
-            submap = read_submap(entry.packed) if entry.packed is not None else build_submap(self._scans(place))
+            packed = self._packed.get(key)
+            submap = build_submap(self._scans(place)) if packed is None else read_submap(packed)
             if len(self._unpacked) >= UNPACKED:
                 self._pack(next(iter(self._unpacked)))
         self._unpacked[key] = submap
@@ -47,32 +38,23 @@ class SubmapCache:
 
     def noise_of(self, place: Place) -> float:
         """How much the submap around a place contradicts itself (``self_violation``)."""
-        entry = self._entry((place.id, place.channel))
-        if entry.noise is None:
-            entry.noise = self_violation(self._scans(place))
-        return entry.noise
+        key = place.id, place.channel
+        if key not in self._noise:
+            self._noise[key] = self_violation(self._scans(place))
+        return self._noise[key]
 
     def drop(self, place: Place) -> None:
         """Drop the submap around a place from the cache."""
-        self._drop((place.id, place.channel))
-
-    def _entry(self, key: _Key) -> _Entry:
-        entry = self._entries.pop(key, None)
-        if entry is None:
-            entry = _Entry()
-            if len(self._entries) >= self._capacity:
-                self._drop(next(iter(self._entries)))
-        self._entries[key] = entry
-        return entry
+        for kept in (self._unpacked, self._packed, self._noise):
+            kept.pop((place.id, place.channel), None)
 
     def _pack(self, key: _Key) -> None:
-        entry, submap = self._entries[key], self._unpacked.pop(key)
-        entry.packed = entry.packed or submap_bytes(submap)
+        submap = self._unpacked.pop(key)
+        if key not in self._packed:
+            self._packed[key] = submap_bytes(submap)
+            if len(self._packed) > self._capacity:
+                del self._packed[next(iter(self._packed))]
 
-    def _drop(self, key: _Key) -> None:
-        self._entries.pop(key, None)
-        self._unpacked.pop(key, None)
-
-    def _scans(self, place: Place) -> list[tuple[PointScan, FloatArray]]:
+    def _scans(self, place: Place) -> list[Located]:
         poses = self._graph.chain(place.id.robot, place.first, place.last)
         return self._space.scans(place.id, place.first, poses)

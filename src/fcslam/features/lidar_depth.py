@@ -20,7 +20,7 @@ CEILING_M = 3.0
 """Keypoints higher above the floor have no position: the LiDAR does not see the ceiling."""
 FLOOR_MARGIN_M: Final = 0.03
 """Keypoints at most this high are dropped, because they may lie on the floor."""
-SAME_SURFACE_M: Final = 0.20
+NEIGHBOURS_M: Final = 0.20
 """Neighbouring returns closer than this lie on one surface."""
 SLANT: Final = 4.0
 """Neighbouring returns also lie on one surface if they are closer than this many times the spacing of their beams at
@@ -104,7 +104,7 @@ def _distances(
         if gap > widest_gap_rad:
             continue
         length = np.hypot(bx - ax, by - ay)
-        surface = length < max(SAME_SURFACE_M, SLANT * gap * max(range_a, range_b))
+        surface = length < max(NEIGHBOURS_M, SLANT * gap * max(range_a, range_b))
         for i in range(len(directions)):
             distance = _crossing(eye, directions[i], (ax, ay, bx - ax, by - ay))
             if not np.isfinite(distance) or distance >= nearest[i]:

@@ -64,11 +64,10 @@ class ClusterDecision:
 
     members: tuple[int, ...]
     """Largest cluster of pairwise consistent closures, or a smaller one if only there the maps agree."""
-    runner_up: tuple[int, ...]
-    """Largest cluster that contradicts it: its closures are inconsistent with at least half of the members."""
     evidence: ClusterEvidence
+    """Its rivals are the largest cluster whose closures are inconsistent with at least half of the members each."""
     contested: bool
-    """Whether the runner-up would be enough to join two maps as well and the cluster is not clearly larger, or the maps
+    """Whether the rivals would be enough to join two maps as well and the cluster is not clearly larger, or the maps
     refute the largest cluster."""
     shortfall: Reason | None
     """Why the cluster is not dominant; a setting is one of ``ConsistencySettings``."""
@@ -237,13 +236,11 @@ def dominant_cluster(
         others = np.flatnonzero(2 * consistent[:, members].sum(axis=1) <= len(members))
         others = np.setdiff1d(others, members)
         second, _ = maximum_clique(consistent[np.ix_(others, others)])
-        runner_up = others[second]
-        evidence, reason = decide(members, runner_up)
+        evidence, reason = decide(members, others[second])
         is_refuted = reason is not None and reason.code in _MAPS_REFUTE
         has_no_lead = reason is not None and reason.code in _NO_LEAD
         decision = ClusterDecision(
             members=tuple(members.tolist()),
-            runner_up=tuple(runner_up.tolist()),
             evidence=evidence,
             contested=is_refuted or (has_no_lead and evidence.rival_places >= settings.minimum_evidence),
             shortfall=reason,

@@ -254,16 +254,6 @@ def _merge_frames(
     frames, maps = [group.identity.copy() for _ in own], list(range(len(own)))
     joining: list[Link] = []
 
-    def merge(a: int, b: int, T_a_b: FloatArray) -> None:
-        older, younger = sorted((maps[a], maps[b]))
-        if older == younger:
-            return
-        # T_mapA_mapB, through the two robots
-        T = group.compose(group.compose(frames[a], T_a_b), group.inverse(frames[b]))
-        T = T if maps[a] == older else group.inverse(T)
-        for robot in (robot for robot, number in enumerate(maps) if number == younger):
-            frames[robot], maps[robot] = group.compose(T, frames[robot]), older
-
     def is_predicted(link: Link) -> bool:
         members = link.closures.select(np.array(link.decision.members, dtype=np.int64))
         T_map_i = group.compose(frames[link.a], own[link.a].poses[members.i])
@@ -272,14 +262,30 @@ def _merge_frames(
         return bool(np.median(group.shift_m(off)) <= DISTINCT_M and np.median(group.turn_rad(off)) <= DISTINCT_RAD)
 
     for relation in known:
-        merge(*relation)
+        merge(frames, maps, *relation)
     for link in sorted(links, key=lambda link: (-link.decision.evidence.separate_places, -len(link.members))):
         found = link if maps[link.a] == maps[link.b] and is_predicted(link) else compare_maps(link)
         if found.decision.dominant:
             joining.append(found)
-            merge(found.a, found.b, found.T_a_b)
+            merge(frames, maps, found.a, found.b, found.T_a_b)
     order = {first: number for number, first in enumerate(dict.fromkeys(maps))}
     return frames, [order[first] for first in maps], joining
+
+
+def merge(frames: list[FloatArray], maps: list[int], a: int, b: int, T_a_b: FloatArray) -> bool:
+    """Put the younger map of two robots into the frame of the older one, if they are two; returns whether they were.
+
+    ``frames`` (``T_map_own``) and ``maps`` (the number of the first robot) of each robot are changed.
+    """
+    older, younger = sorted((maps[a], maps[b]))
+    if older == younger:
+        return False
+    group = group_of(T_a_b)
+    T = group.compose(group.compose(frames[a], T_a_b), group.inverse(frames[b]))  # between the maps of a and b
+    T = T if maps[a] == older else group.inverse(T)
+    for robot in (robot for robot, number in enumerate(maps) if number == younger):
+        frames[robot], maps[robot] = group.compose(T, frames[robot]), older
+    return True
 
 
 def _edges_within_maps(evidence: JointEvidence, maps: Sequence[int]) -> NDArray[np.bool_]:

@@ -23,7 +23,7 @@ from fcslam.geometry import se2
 from fcslam.learning.homography import BORDER_PX, CORRECT_PX
 from fcslam.records import CameraModel, FloatArray
 
-SAME_SURFACE_M: Final = 0.15
+SAME_POINT_M: Final = 0.15
 """Largest distance, seen from above, between a point and the surface that the other view shows in its direction."""
 SEARCH_PX: Final = 12.0
 """Largest distance between a predicted pixel and a keypoint that may be the same point, before the correction."""
@@ -80,7 +80,7 @@ def predict(first: Keyframe, second: Keyframe, T_first_second: FloatArray) -> tu
     shown = first.placed & inside
     surface, met = locate_among(pixels[shown].astype(np.float32), second.camera, second.surroundings)
     gap_m = np.hypot(*(surface[:, :2] - there[shown, :2]).T)
-    shown[shown] = met & (gap_m <= SAME_SURFACE_M)
+    shown[shown] = met & (gap_m <= SAME_POINT_M)
     return pixels, shown
 
 

@@ -64,7 +64,7 @@ LEAST_RATIO, LEAST_RIVAL_M, LARGEST_VIOLATION = 1.5, 5.0, 0.12
 """The best alignment after a gap scores higher than the best one elsewhere by this factor. The one elsewhere counts as
 so many metres at least: a few walls are never unique. No larger share of the walls of one lies in free space of the
 other."""
-LARGEST_UNSEEN_M = 15.0
+LARGEST_STEP_M = 15.0
 """A robot that moved farther than this, in metres, between two scans is lost: nobody saw the way."""
 
 
@@ -83,7 +83,7 @@ class LostConfig(Settings):
 def has_moved_unseen(before: LaserScan, now: LaserScan) -> bool:
     """Whether a robot moved so far between two scans that odometry alone must not tie their places together."""
     x, y, _ = se2.motion(before.T_odom_base, now.T_odom_base)
-    return math.hypot(x, y) > LARGEST_UNSEEN_M
+    return math.hypot(x, y) > LARGEST_STEP_M
 
 
 def is_doubtful(

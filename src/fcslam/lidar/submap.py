@@ -5,7 +5,7 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,37 +68,25 @@ Located = tuple[PointScan, FloatArray]
 """A scan and its ``T_anchor_base``, shape (3,)."""
 
 
-class _Cells(NamedTuple):
-    corner: FloatArray
-    shape: tuple[int, int]
-
-
 def build_submap(scans: Sequence[Located], radius_m: float = RADIUS_M) -> Submap:
-    """Build a submap of scans with their ``T_anchor_base``, shape (3,), in the anchor's base.
-
-    Surfaces and free space farther than ``radius_m`` from the anchor are left out.
-    """
+    """Build a submap of scans in the anchor's base, without what is farther than ``radius_m`` from the anchor."""
     near = [(_near(scan, pose, radius_m), pose) for scan, pose in scans]
     field = field_of(near)
-    cells = _cells(field.points[_spaced_rows(field.points)], near)
-    return _without_moving(field, _beam_counts(near, cells), cells.corner)
+    (counts,), corner = _beam_counts([near], field.points[_spaced_rows(field.points)])
+    return _without_moving(field, counts, corner)
 
 
 def build_with_halves(scans: Sequence[Located], radius_m: float) -> tuple[Submap, Submap, Submap]:
-    """The submap of at least two scans, as ``build_submap``, and those of its first and second half of them."""
+    """The submap of at least two scans, as ``build_submap``, and those of the first and the second half of them."""
     near, middle = [(_near(scan, pose, radius_m), pose) for scan, pose in scans], len(scans) // 2
     halves = near[:middle], near[middle:]
     first, second = map(field_of, halves)
     whole = first.copy()
     for scan, pose in halves[1]:
         whole.insert(scan, pose)
-    cells = _cells(np.concatenate([whole.points, first.points, second.points]), near)
-    in_first, in_second = (_beam_counts(half, cells) for half in halves)
-    return (
-        _without_moving(whole, in_first + in_second, cells.corner),
-        _without_moving(first, in_first, cells.corner),
-        _without_moving(second, in_second, cells.corner),
-    )
+    (one, other), corner = _beam_counts(halves, np.concatenate([whole.points, first.points, second.points]))
+    parts = _without_moving(first, one, corner), _without_moving(second, other, corner)
+    return _without_moving(whole, one + other, corner), *parts
 
 
 def _without_moving(field: SurfelField, counts: NDArray[np.uint16], corner: FloatArray) -> Submap:
@@ -114,29 +102,27 @@ def _near(scan: PointScan, T_anchor_base: FloatArray, radius_m: float) -> PointS
     return scan.thinned(CELL_M, radius_m=radius_m)
 
 
-def _cells(surface: FloatArray, scans: Sequence[Located]) -> _Cells:
-    """The cells around a surface (N, 2) and the scans: their lower left corner, and how many rows and columns."""
-    poses = np.array([pose for _, pose in scans]).reshape(-1, 3)
+def _beam_counts(parts: Sequence[Sequence[Located]], surface: FloatArray) -> tuple[NDArray[np.uint16], FloatArray]:
+    """How many scans of each part passed each cell around a surface, and how many had a return in it.
+
+    Returns the counts, shape (parts, 2, H, W), and the cells' lower left corner.
+    """
+    poses = np.array([pose for part in parts for _, pose in part]).reshape(-1, 3)
     around = np.concatenate([surface, poses[:, :2]]) if len(surface) else poses[:, :2]
     corner = around.min(axis=0) - FREE_CELL_M
     columns, rows = np.ceil((around.max(axis=0) - corner) / FREE_CELL_M).astype(np.int64) + 1
-    return _Cells(corner, (int(rows), int(columns)))
-
-
-def _beam_counts(scans: Sequence[Located], cells: _Cells) -> NDArray[np.uint16]:
-    """How many scans passed each cell, and how many had a return in it, shape (2, H, W)."""
-    counts = np.zeros((2, *cells.shape), np.uint16)
-    latest = np.full((2, *cells.shape), -1, np.int32)
-    for number, (scan, pose) in enumerate(scans):
-        _count_beams(scan.points, scan.origin, pose, cells.corner, number, latest, counts[0], counts[1])
-    return counts
+    counts = np.zeros((len(parts), 2, rows, columns), np.uint16)
+    for scans, (passes, hits) in zip(parts, counts, strict=True):
+        latest = np.full((2, rows, columns), -1, np.int32)
+        for number, (scan, pose) in enumerate(scans):
+            _count_beams(scan.points, scan.origin, pose, corner, number, latest, passes, hits)
+    return counts, corner
 
 
 def seen_through(submap: Submap, scans: Sequence[Located]) -> NDArray[np.bool_]:
     """Points of ``submap.surface`` that more of its scans passed than saw, as at a railing, shape (N,)."""
-    cells = _cells(submap.surface.points, scans)
-    passes, hits = _beam_counts(scans, cells)
-    column, row = np.floor((submap.surface.points - cells.corner) / FREE_CELL_M).astype(np.int64).T
+    ((passes, hits),), corner = _beam_counts([scans], submap.surface.points)
+    column, row = np.floor((submap.surface.points - corner) / FREE_CELL_M).astype(np.int64).T
     return np.asarray(passes[row, column] > hits[row, column])
 
 
