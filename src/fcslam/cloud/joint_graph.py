@@ -15,7 +15,7 @@ from fcslam.records import Constraint, FloatArray, KeyscanId
 from fcslam.storage.state_file import State
 
 AGREES_SIGMAS = 3.0
-"""What is within so many standard deviations of a measurement agrees with it."""
+"""A pose within this many standard deviations of a measurement agrees with it."""
 SOLVED_SHARE = 0.05
 """Share of all closures that comes in between two solves, at least."""
 

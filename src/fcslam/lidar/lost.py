@@ -54,8 +54,8 @@ The cabin says where its door is, so a part of the walls decides; but more of th
 LEAST_OVERLAP = LOOSE.overlap
 """Least share of all points in known area; below it, nothing is decided."""
 STAYED_M, LARGEST_SPEED, REACHABLE_S = 1.0, 2.0, 5.0
-"""Without odometry, a robot is looked for within so many metres, and so many more for each second of a gap in the
-scans, m/s. After a longer gap, in seconds, that would be another room with the same walls: it must be where it was."""
+"""Without odometry, the search for a robot has this radius, metres, which grows with a gap in the scans, m/s. After a
+longer gap, seconds, it might find another room with the same walls: the robot must be where it was."""
 SEEN_S = 2.0 * LONGEST_GAP_S
 """After a shorter gap, in seconds, a robot that is found nowhere counts as where it was: a match finds it again."""
 GAP_TRAVEL_M = 2.0 * DOUBTFUL_TRAVEL_M
