@@ -21,6 +21,7 @@ from fcslam.records import (
 )
 from fcslam.runs import ClosureRow, RobotTrajectory, Run, read_tum, write_tum
 from fcslam.sources import write_bag
+from tests.lidar.worlds import cast
 
 LASER = LaserModel(360, -np.pi, 2.0 * np.pi / 360, 30.0)
 CAMERA = CameraModel(64, 48, 40.0, 40.0, 31.5, 23.5, Transform((0.0, 0.0, 0.5), (-0.5, 0.5, -0.5, 0.5)))
@@ -29,30 +30,18 @@ WALLS = np.array([[0, 0, 8, 0], [8, 0, 8, 6], [8, 6, 0, 6], [0, 6, 0, 0], [4, 0,
 """Of a room of 8 m by 6 m with a wall that stands into it, by both ends."""
 
 
-def hit(start, directions):
-    """How far from ``start`` (2,) the nearest wall is in each direction (K, 2)."""
-    a, along = WALLS[:, :2] - start, WALLS[:, 2:] - WALLS[:, :2]
-    cross = directions[:, None, 0] * along[:, 1] - directions[:, None, 1] * along[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        far = (a[:, 0] * along[:, 1] - a[:, 1] * along[:, 0]) / cross
-        share = (a[:, 0] * directions[:, None, 1] - a[:, 1] * directions[:, None, 0]) / cross
-    return np.where((far > 1e-9) & (share >= 0.0) & (share <= 1.0), far, np.inf).min(axis=1)
-
-
 def ranges_from(pose):
-    angles = pose[2] + LASER.angles_rad()
-    return hit(pose[:2], np.column_stack((np.cos(angles), np.sin(angles))))
+    return cast(pose[:2], pose[2] + LASER.angles_rad(), WALLS)
 
 
 def overlap_oracle(a, b):
     """Of what stands ahead of a, the share that nothing hides from b, in the field of view of b."""
     angles = a[2] + np.linspace(-HALF_VIEW_RAD, HALF_VIEW_RAD, 400)
     directions = np.column_stack((np.cos(angles), np.sin(angles)))
-    points = a[:2] + hit(a[:2], directions)[:, None] * directions
-    away = points - b[:2]
-    distance = np.hypot(*away.T)
-    in_view = np.abs(se2.wrap_angle(np.arctan2(away[:, 1], away[:, 0]) - b[2])) <= HALF_VIEW_RAD
-    free = hit(b[:2], away / distance[:, None]) >= distance - 1e-6
+    away = a[:2] + cast(a[:2], angles, WALLS)[:, None] * directions - b[:2]
+    headings = np.arctan2(away[:, 1], away[:, 0])
+    in_view = np.abs(se2.wrap_angle(headings - b[2])) <= HALF_VIEW_RAD
+    free = cast(b[:2], headings, WALLS) >= np.hypot(*away.T) - 1e-6
     return (in_view & free).mean()
 
 

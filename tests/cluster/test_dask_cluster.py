@@ -13,23 +13,18 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from fcslam.cli import main
 from fcslam.cluster.verifying import DaskCluster, verifying
 from fcslam.errors import InputError
-from fcslam.geometry import se2
-from fcslam.lidar.pair_verification import Pair, VerificationPool, verify_here
-from fcslam.lidar.scan import point_scan
-from fcslam.lidar.submap import build_submap
+from fcslam.lidar.pair_verification import VerificationPool, verify_here
 from fcslam.mission.mission_store import MissionStore
 from fcslam.service.credentials import make_cluster_credentials
 from fcslam.service.mission_folder import MissionFolder
 from fcslam.service.supervisor import READY, WorkerTask
-from tests import small_fleet
 from tests.cluster.clusters import Cluster, needs_dask, written_address
-from tests.lidar.test_pair_verification import written
+from tests.lidar.test_pair_verification import pairs_of, written
 from tests.mission.test_mission_file import contents
 from tests.waiting import wait_for
 
@@ -40,16 +35,7 @@ DIFFERENT = "whose sources or libraries differ from fcslam 0.1.0 here; install t
 
 @pytest.fixture(scope="module")
 def pairs():
-    (robot,) = small_fleet.draw(1, path_length_m=12.0).robots
-    kept = list(robot.scans())[::2]
-    poses = small_fleet.truth_at(robot, [scan.stamp for scan in kept])
-    submaps = [build_submap([(point_scan(scan.ranges_m, scan.laser), np.zeros(3))]) for scan in kept]
-    rng = np.random.default_rng(4)
-    rows = [(a, b, off) for a in range(len(kept)) for b in range(a) for off in (0.02, 0.5)]
-    return [
-        Pair(submaps[a], submaps[b], se2.between(poses[a], poses[b]) + rng.normal(0.0, (off, off, 0.1 * off)))
-        for a, b, off in rows[:300]
-    ]
+    return pairs_of(2, lambda count: [(a, b, off) for a in range(count) for b in range(a) for off in (0.02, 0.5)][:300])
 
 
 @pytest.fixture(scope="module")

@@ -40,19 +40,24 @@ def packets():
     return in_order(packet for robot in small_fleet.draw(2).robots for packet in small_fleet.sent_by(robot))
 
 
-@pytest.fixture(scope="module")
-def pairs():
-    """Submaps along one drive, at guesses that are right, slightly off and wrong."""
+def pairs_of(every, rows_of):
+    """Pairs of submaps along one drive; ``rows_of`` their count gives the numbers of each pair and how far its guess
+    is off."""
     rng = np.random.default_rng(4)
     (robot,) = small_fleet.draw(1, path_length_m=12.0).robots
-    kept = list(robot.scans())[::4]
+    kept = list(robot.scans())[::every]
     poses = small_fleet.truth_at(robot, [scan.stamp for scan in kept])
     submaps = [build_submap([(point_scan(scan.ranges_m, scan.laser), np.zeros(3))]) for scan in kept]
-    rows = [(a, a + 1, off) for a in range(len(kept) - 1) for off in (0.02, 0.2, 3.0)]
     return [
         Pair(submaps[a], submaps[b], se2.between(poses[a], poses[b]) + rng.normal(0.0, (off, off, 0.1 * off)))
-        for a, b, off in rows
+        for a, b, off in rows_of(len(kept))
     ]
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    """At guesses that are right, slightly off and wrong."""
+    return pairs_of(4, lambda count: [(a, a + 1, off) for a in range(count - 1) for off in (0.02, 0.2, 3.0)])
 
 
 @pytest.fixture

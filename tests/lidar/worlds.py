@@ -89,6 +89,16 @@ def cast(origins, angles, segments):
     return np.where(hit, along, np.inf).min(axis=1)
 
 
+def with_disc(ranges_m, pose, centre, radius_m, laser):
+    """The ranges (B,) with a disc in their way, as another robot is."""
+    angles = pose[2] + laser.angles_rad()
+    rays, apart = np.stack((np.cos(angles), np.sin(angles)), axis=-1), np.asarray(centre) - pose[:2]
+    along = rays @ apart
+    half = radius_m**2 - (apart @ apart - along**2)
+    reached = along - np.sqrt(np.maximum(half, 0.0))
+    return np.where((half > 0.0) & (reached > 0.0) & (reached < ranges_m), reached, ranges_m).astype(np.float32)
+
+
 def scan_at(pose, segments, laser=LASER, noise_m=0.0, rng=None):
     """Points seen from one pose."""
     return point_scan(frozen(ranges(pose, segments, laser, noise_m, rng)[0], np.float32), laser)

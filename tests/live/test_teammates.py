@@ -24,21 +24,11 @@ def mate(x, y, age_s=0.2):
     return float(x), float(y), age_s
 
 
-def with_disc(ranges, pose, centre):
-    """The ranges with a robot at ``centre``, and which beams hit it."""
-    angles = LASER.angles_rad() + pose[2]
-    rays, apart = np.stack((np.cos(angles), np.sin(angles)), axis=-1), np.asarray(centre) - pose[:2]
-    along = rays @ apart
-    half = RADIUS_M**2 - (apart @ apart - along**2)
-    reached = along - np.sqrt(np.maximum(half, 0.0))
-    hit = (half > 0.0) & (reached > 0.0) & (reached < ranges)
-    return np.where(hit, reached, ranges), hit
-
-
 def scan_at(pose, segments, centre=None):
-    ranges = worlds.ranges(pose, segments, LASER)[0]
-    ranges, hit = (ranges, np.zeros(360, bool)) if centre is None else with_disc(ranges, pose, centre)
-    return LaserScan(0.0, frozen(ranges, np.float32), LASER, frozen(np.zeros(3))), hit
+    """A scan, with a robot at ``centre`` if it is given, and which beams hit that."""
+    free = worlds.ranges(pose, segments, LASER)[0]
+    ranges = free if centre is None else worlds.with_disc(free, pose, centre, RADIUS_M, LASER)
+    return LaserScan(0.0, frozen(ranges, np.float32), LASER, frozen(np.zeros(3))), ranges < free
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +122,7 @@ def convoy(robot, fleet):
     for k, (pose, empty) in enumerate(zip(truth, measured, strict=True)):
         ahead = pose + np.array((1.0, 0.0, 0.0))
         fleet.hear(mate(*ahead[:2]))
-        ranges, _ = with_disc(empty, pose, ahead[:2])
+        ranges = worlds.with_disc(empty, pose, ahead[:2], RADIUS_M, LASER)
         poses.append(robot.add(ranges, 0.1 * k, odometry[k]))
     return truth, np.array(poses)
 

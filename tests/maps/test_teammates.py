@@ -9,26 +9,19 @@ from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.fusion import fuse
 from fcslam.maps.occupancy_map import Occupancy
 from fcslam.records import Keyscan, KeyscanId, LaserModel
+from tests.lidar.worlds import box, ranges, with_disc
 
 BEAMS, SIDE_M, RADIUS_M = 360, 8.0, 0.25
 LASER = LaserModel(BEAMS, -np.pi, 2 * np.pi / BEAMS, 20.0)
 CONFIG = OccupancyConfig()
 
 
-def ranges(pose, others):
+def seen(pose, others):
     """What a laser measures in a square room with other robots as discs."""
-    angles = LASER.angles_rad() + pose[2]
-    rays = np.stack((np.cos(angles), np.sin(angles)), axis=-1)
-    with np.errstate(divide="ignore"):
-        walls = np.where(rays > 0, (SIDE_M - pose[:2]) / rays, -pose[:2] / rays)
-    reached = walls.min(axis=1)
+    ranges_m = ranges(pose, box(0.0, 0.0, SIDE_M, SIDE_M), LASER)[0]
     for other in others:
-        centre = other[:2] - pose[:2]
-        along = rays @ centre
-        half = RADIUS_M**2 - (centre @ centre - along**2)
-        hit = along - np.sqrt(np.maximum(half, 0.0))
-        reached = np.where((half > 0.0) & (hit > 0.0) & (hit < reached), hit, reached)
-    return reached.astype(np.float32)
+        ranges_m = with_disc(ranges_m, pose, other[:2], RADIUS_M, LASER)
+    return ranges_m
 
 
 def drive(ways, claimed=None):
@@ -38,7 +31,7 @@ def drive(ways, claimed=None):
     for name, way in ways.items():
         for number, pose in enumerate(way):
             others = [other[number] for mate, other in ways.items() if mate != name]
-            keyscans.append(Keyscan(KeyscanId(name, number), float(number), ranges(pose, others)))
+            keyscans.append(Keyscan(KeyscanId(name, number), float(number), seen(pose, others)))
             poses.append((claimed or {}).get(name, way)[number])
     return keyscans, np.array(poses)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fcslam.sources import open_source
+from tests.lidar.worlds import box, cast
 from tests.sources.bag_messages import mounted, odom, save, scan
 from tests.sources.carmen_text import flaser, refusal, scans_of
 from tests.sources.carmen_text import save as save_log
@@ -20,10 +21,7 @@ def pose(step):
 def ranges(step, quantum=0.001):
     """Ranges in a room of 4.4 m x 7.4 m."""
     x, y, heading = pose(step)
-    angles = heading + np.linspace(-np.pi / 2, np.pi / 2, BEAMS)
-    c, s = np.cos(angles), np.sin(angles)
-    with np.errstate(divide="ignore"):
-        walls = np.minimum(np.where(c > 0, 2.2 - x, -2.2 - x) / c, np.where(s > 0, 3.7 - y, -3.7 - y) / s)
+    walls = cast((x, y), heading + np.linspace(-np.pi / 2, np.pi / 2, BEAMS), box(-2.2, -3.7, 2.2, 3.7))
     return np.round(walls / quantum) * quantum
 
 
