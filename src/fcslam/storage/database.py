@@ -47,17 +47,18 @@ class Database(RowStore):
         super().__init__()
         self._path = path
         self._lock, self._reading_lock = threading.Lock(), threading.Lock()
+        # FULL: acknowledged packets must survive a loss of power.
+        pragmas = ("locking_mode=EXCLUSIVE", "synchronous=NORMAL") if exclusive else ("synchronous=FULL",)
         with translate_errors(path):
+            timeout_s = 0.0 if exclusive else _BUSY_S
+            self._connection = self._reading = _connected(path, *pragmas, "journal_mode=WAL", timeout_s=timeout_s)
+        try:
             if exclusive:
-                pragmas = ("locking_mode=EXCLUSIVE", "journal_mode=WAL", "synchronous=NORMAL")
-                self._connection = self._reading = _connected(path, *pragmas, timeout_s=0.0)
                 self._reading_lock = self._lock
             else:
-                # FULL: acknowledged packets must survive a loss of power.
-                self._connection = _connected(path, "journal_mode=WAL", "synchronous=FULL")
                 # A commit takes as long as the disk does. A second connection lets readers see the state before it.
-                self._reading = _connected(path, "query_only=ON")
-        try:
+                with translate_errors(path):
+                    self._reading = _connected(path, "query_only=ON")
             with self.transaction() as connection:
                 if not _shape(connection)[1]:
                     _check_content(connection)  # its tables may be lost
@@ -139,8 +140,12 @@ def _connected(path: Path, *pragmas: str, timeout_s: float = _BUSY_S) -> SealedC
     connection = sqlite3.connect(
         path, timeout=timeout_s, isolation_level=None, check_same_thread=False, factory=SealedConnection
     )
-    for pragma in ("trusted_schema=OFF", *pragmas):
-        connection.execute(f"PRAGMA {pragma}")
+    try:
+        for pragma in ("trusted_schema=OFF", *pragmas):
+            connection.execute(f"PRAGMA {pragma}")
+    except sqlite3.Error:
+        connection.close()
+        raise
     connection.create_function("seal", -1, seal, deterministic=True)
     return connection
 
