@@ -59,7 +59,7 @@ def localize(
         ),
     ] = None,
     floor: Annotated[
-        str, typer.Option(help="Floor that the robot is on.", show_default="that of the map, if it has one only")
+        str, typer.Option(help="Floor that the robot is on.", show_default="the floor of the map, if it has only one")
     ] = "",
     update: Annotated[
         bool,

@@ -21,7 +21,7 @@ Start = Annotated[
     Path | None,
     typer.Option(
         help="Weights to start from: a checkpoint.state, a detector.onnx, or vgg, which comes with fcslam.",
-        show_default="the network that comes with fcslam; with a teacher, none",
+        show_default="the bundled network; with a teacher, none",
     ),
 ]
 LEARNING_FILE = "learning.yaml"

@@ -76,8 +76,8 @@ LARGEST_OUTBOX_BYTES = 256_000_000
 class Robot(LiveTracker):
     """One robot that maps while it drives.
 
-        laser = fcslam.LaserModel(beam_count=360, angle_min_rad=-math.pi, angle_increment_rad=math.radians(1.0),
-                                  max_range_m=12.0, T_base_laser=(0.2, 0.0, 0.0))
+        one_degree = math.radians(1.0)
+        laser = fcslam.LaserModel(360, -math.pi, one_degree, max_range_m=12.0, T_base_laser=(0.2, 0.0, 0.0))
         with fcslam.Robot("anna", laser) as robot:
             for ranges_m, stamp, odometry in my_driver():
                 pose = robot.add_scan(ranges_m, stamp, odometry)

@@ -14,7 +14,7 @@ TOKEN, AUTHORITY, CERTIFICATE, KEY = "token", "ca.pem", "client.pem", "client.ke
 
 @dataclass(frozen=True, slots=True)
 class Server:
-    """A cloud, how a robot shows it who it is, and how much the robot may send."""
+    """Address of a cloud, the robot's credentials, and the limit of its uplink."""
 
     url: str
     """Address of the cloud, or those of its instances with commas between them."""
