@@ -235,7 +235,7 @@ def _certificates(
         members = [robot for robot in result.robots if robot.map_index == k and len(robot.stamps)]
         if members and fused.cells.any() and (k == 0 or sum(len(robot.stamps) for robot in members) >= LEAST_DRAWN):
             paths = [MappedPath(robot.T_map_base, robot.variables) for robot in members]
-            certificates[k] = certify(result.graph, paths, fused, None, robot_radius_m, measured)
+            certificates[k] = certify(result.graph, paths, fused, None, robot_radius_m, result.space_graph or measured)
     return certificates
 
 

@@ -105,7 +105,7 @@ def certify(
 
     ``paths`` are the sessions of the map, at least one keyscan in all; the first one begins its frame. A cell is good
     if the bound of the error within ``WITHIN_M`` around it is at most ``bar_m``, by default a cell of the map.
-    ``measured`` is the graph before a plan or surveyed tags bent it, whose residuals are those of the measurements.
+    ``measured`` has the residuals of the measurements: the graph before a plan or surveyed tags bent it, or in space.
     """
     bar_m = occupancy.resolution_m if bar_m is None else bar_m
     places = covariances(graph, paths, measured)
@@ -187,7 +187,7 @@ def _contradiction(
     near = np.array([_distances(poses, place) <= WITHIN_M for place in poses[chosen]])
     of_edges = near[:, rows[edges.i[inside]]]
     redundant = np.maximum(of_edges.sum(axis=1) - near.sum(axis=1), FEWEST_REDUNDANT)
-    return np.asarray(np.sqrt(of_edges @ graph.chi2(rows=inside) / (3.0 * redundant)))
+    return np.asarray(np.sqrt(of_edges @ graph.chi2(rows=inside) / (graph.group.freedom * redundant)))
 
 
 def _part(graph: PoseGraph, poses: FloatArray, rows: NDArray[np.int64]) -> PoseGraph:
