@@ -184,28 +184,21 @@ PAGES: dict[Path, Callable[[], str]] = {
 
 
 def table(settings: Settings, path: str = "", documented: tuple[type[Settings], ...] = ()) -> str:
-    """The classes and the keys of ``settings`` and of those nested in them, but the ``documented`` ones."""
-    found = list(keys_of(settings, path, documented))
-    places = dict.fromkeys(place_of(kind) for kind, _ in found)
-    return "\n".join([f"In the code: {'; '.join(places)}.", "", *HEADER, *(line for _, line in found), ""])
+    """The keys of ``settings`` and of those nested in them, but the ``documented`` ones."""
+    return "\n".join([*HEADER, *keys_of(settings, path, documented), ""])
 
 
-def keys_of(settings: Settings, path: str, documented: tuple[type[Settings], ...]) -> Iterator[tuple[type, str]]:
-    """Class and line of each key; nested settings follow the plain keys."""
+def keys_of(settings: Settings, path: str, documented: tuple[type[Settings], ...]) -> Iterator[str]:
+    """The line of each key; nested settings follow the plain keys."""
     nested = []
     for key, field in type(settings).model_fields.items():
         value = getattr(settings, key)
         if not isinstance(value, Settings):
-            yield type(settings), row(f"{path}{key}", field, value)
+            yield row(f"{path}{key}", field, value)
         elif not isinstance(value, documented):
             nested.append((value, f"{path}{key}."))
     for value, inner in nested:
         yield from keys_of(value, inner, documented)
-
-
-def place_of(kind: type) -> str:
-    """The class and its file, as the architecture page names both."""
-    return f"`{kind.__name__}` in `{kind.__module__.removeprefix('fcslam.').replace('.', '/')}.py`"
 
 
 def row(path: str, field: FieldInfo, value: Any) -> str:
