@@ -147,7 +147,7 @@ def test_every_packet_is_acknowledged_and_a_place_may_bring_a_correction(scripte
             versions.append(reply.body.version)
     assert versions == list(range(len(versions)))
     for session, correction in corrected.items():
-        assert not is_news(correction, cloud.fleet.correction(session)) or session == "a"
+        assert not is_news(correction, *cloud.fleet.corrections(session)) or session == "a"
     assert {robot: c.map_index for robot, c in corrected.items()} == {"a": 0, "b": 0}
     assert np.allclose(corrected["b"].T_map_odom, 0.0, atol=1e-6), "both started at the same pose"
 

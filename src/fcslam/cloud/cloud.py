@@ -74,10 +74,10 @@ class Cloud(FleetHost):
         return replies(robot, {epoch: self.log.next_sequence(session)}, news, known)
 
     def _corrected(self, packet: Packet, session: str) -> SessionCorrection | None:
-        estimate, last = self.fleet.correction(session), self._corrections.get(session)
-        if estimate is None or not is_news(last.correction if last else None, estimate):
+        estimates, last = self.fleet.corrections(session), self._corrections.get(session)
+        if not estimates or not is_news(last.correction if last else None, estimates[0]):
             return None
-        correction = replace(estimate, robot=packet.robot, version=self._sent)
+        correction = replace(estimates[0], robot=packet.robot, version=self._sent)
         self._sent += 1
         self._corrections[session] = SessionCorrection(packet.robot, packet.epoch, packet.time, correction)
         return self._corrections[session]

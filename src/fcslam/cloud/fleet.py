@@ -4,7 +4,7 @@ A plain object without a network. Robots stay in maps of their own until the evi
 evidence may revoke a join. ``finalize`` depends on the set of packets only, not on their order.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -105,8 +105,6 @@ class Fleet:
                 check_constraint(closure, LONGEST_CLOSURE_M)
                 self._decisions.add_local(with_least_noise(closure))
             case Place() as place:
-                self._check_submap(place)
-                self._sessions.add_place(place)
                 self._add_place(place)  # place recognition and map fusion
             case TagSighting() as sighting:
                 self._add_sighting(sighting)
@@ -233,17 +231,12 @@ class Fleet:
         self._replayed = order, replay.state()
         return replay.conclude()
 
-    def correction(self, session: str) -> Correction | None:
-        """Where the session's odometry lies in its map by now; None if removed or without a keyscan."""
-        rigid = self._rigid_fusion()
-        return self._correction(session, map_indices(rigid.maps if rigid else self._present_maps()), rigid)
-
-    def corrections(self) -> tuple[Correction, ...]:
-        """The corrections of all sessions that are not removed."""
+    def corrections(self, *chosen: str) -> tuple[Correction, ...]:
+        """Where the odometry of sessions lies in their maps by now: of all, or of those chosen; not of removed ones."""
         rigid = self._rigid_fusion()
         indices = map_indices(rigid.maps if rigid else self._present_maps())
-        corrections = (self._correction(session, indices, rigid) for session in self._present())
-        return tuple(correction for correction in corrections if correction is not None)
+        sessions = (session for session in chosen or self._present() if session in indices)
+        return tuple(self._correction(session, indices[session], rigid) for session in sessions)
 
     def vocabularies(self) -> tuple[VocabularyState, ...]:
         """The state of every vocabulary."""
@@ -270,9 +263,7 @@ class Fleet:
         own: dict[str, FloatArray] = {session: frozen(se2.between(T[0], T)) for session, T in poses.items()}
         return fuse_rigidly(self._present_closures(), own)
 
-    def _correction(self, session: str, indices: Mapping[str, int], rigid: Fusion | None) -> Correction | None:
-        if session not in indices:
-            return None
+    def _correction(self, session: str, map_index: int, rigid: Fusion | None) -> Correction:
         quality = self._quality.of(session, self._decisions.map_of(session), self._decisions.closures)
         changes, pose_of = self._decisions.changes, self._graph.pose
         members: Sequence[str] = self._decisions.map_of(session)
@@ -284,7 +275,7 @@ class Fleet:
         group = self._graph.group
         T = T_placed_map(members, self._sessions, pose_of, changes, group)
         T_map_odom = frozen(T_map_odom if T is None else group.compose(T, T_map_odom))
-        return Correction(session, self._decisions.version, indices[session], T_map_odom, quality)
+        return Correction(session, self._decisions.version, map_index, T_map_odom, quality)
 
     def _add_keyscan(self, keyscan: Keyscan, sequence: int) -> None:
         self._sessions.add_keyscan(keyscan, sequence)
@@ -305,13 +296,11 @@ class Fleet:
             self._decisions.add_matches((match for match in matches if match.i.robot != session), session)
         self._optimize_if_due()
 
-    def _check_submap(self, place: Place) -> None:
-        robot = place.id.robot
-        self._sessions.require(place.id, KeyscanId(robot, place.last))
-        check_submap(place, self._graph.chain(robot, place.first, place.last))
-
     def _add_place(self, place: Place) -> None:
         session, decisions = place.id.robot, self._decisions
+        self._sessions.require(place.id, KeyscanId(session, place.last))
+        check_submap(place, self._graph.chain(session, place.first, place.last))
+        self._sessions.add_place(place)
         is_compared = self._config.join_maps and self._sessions.hold(place)
         matches = self._recognition.match(place, decisions.map_of(session)) if is_compared else []
         decisions.add_matches(matches, session)
