@@ -68,12 +68,15 @@ class Outputs:
         self._maps: dict[str, OccupancyMap] = {}
         self._teammates: set[str] = set()
         self._goal_xy: FloatArray = np.full(2, np.nan)
-        self._begin(MAP, GRID, LATCHED)
-        self._begin("pose", POSE, STREAMED)
-        self._begin("path", PATH, LATCHED)
-        self._begin("closures", MARKERS, LATCHED)
-        self._begin(tf, TRANSFORMS, TRANSFORMED)
-        self._begin(DIAGNOSTICS_TOPIC, DIAGNOSTICS, STREAMED)
+        for topic, kind, quality in (
+            (MAP, GRID, LATCHED),
+            ("pose", POSE, STREAMED),
+            ("path", PATH, LATCHED),
+            ("closures", MARKERS, LATCHED),
+            (tf, TRANSFORMS, TRANSFORMED),
+            (DIAGNOSTICS_TOPIC, DIAGNOSTICS, STREAMED),
+        ):
+            self._publisher(topic, kind, quality)
 
     def transform(self, stamp_ns: int, odom_frame: str, T_map_odom: FloatArray) -> None:
         """Publish ``map -> odom`` for this stamp."""
@@ -82,11 +85,8 @@ class Outputs:
 
     def pose(self, stamp_ns: int, T_map_base: FloatArray, covariance: FloatArray) -> None:
         """Publish the pose (P,) of a scan with its covariance (6, 6)."""
-        make = self._codec.make
-        whole = in_space(T_map_base)
-        posed = make(
-            "geometry_msgs/PoseWithCovariance", pose=self._codec.pose(whole), covariance=np.array(covariance.ravel())
-        )
+        make, pose = self._codec.make, self._codec.pose(in_space(T_map_base))
+        posed = make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=np.array(covariance.ravel()))
         header = self._codec.header(stamp_ns, self._map_frame)
         self._send("pose", POSE, make(POSE, header=header, pose=posed))
 
@@ -106,45 +106,40 @@ class Outputs:
 
         Frontiers that no robot has, and those that robots have, have shape (N, 2), metres in ``map``.
         """
-        with self._lock:
-            self._begin(FLEET_FRONTIERS, MARKERS, LATCHED)
-            self._begin(FLEET_GOAL, POSE_STAMPED, LATCHED)
-            markers = [
-                self._marker(now_ns, name, self._shapes.SPHERE_LIST, SPHERE_M, colour, points)
-                for name, colour, points in (("free", (0.9, 0.6, 0.1), free_xy), ("taken", (0.1, 0.4, 0.9), taken_xy))
-            ]
-            self._send(FLEET_FRONTIERS, MARKERS, self._codec.make(MARKERS, markers=markers))
-            if T_map_goal is not None and not np.array_equal(T_map_goal[:2], self._goal_xy):
-                self._goal_xy = T_map_goal[:2]
-                self._send(FLEET_GOAL, POSE_STAMPED, self._posed(now_ns, T_map_goal))
+        markers = [
+            self._marker(now_ns, name, self._shapes.SPHERE_LIST, SPHERE_M, colour, points)
+            for name, colour, points in (("free", (0.9, 0.6, 0.1), free_xy), ("taken", (0.1, 0.4, 0.9), taken_xy))
+        ]
+        self._send(FLEET_FRONTIERS, MARKERS, self._codec.make(MARKERS, markers=markers), LATCHED)
+        self._publisher(FLEET_GOAL, POSE_STAMPED, LATCHED)
+        if T_map_goal is not None and not np.array_equal(T_map_goal[:2], self._goal_xy):
+            self._goal_xy = T_map_goal[:2]
+            self._send(FLEET_GOAL, POSE_STAMPED, self._posed(now_ns, T_map_goal), LATCHED)
 
     def quality(self, now_ns: int, robot: str, maps: "Sequence[QualityReply]") -> None:
         """Publish how good the map of a robot is, by its certificate."""
-        with self._lock:
-            self._begin(FLEET_QUALITY, DIAGNOSTICS, LATCHED)
-            statuses = [
-                self._status(
-                    f"map {one.map_index}",
-                    robot,
-                    self._levels.WARN if one.drives else self._levels.OK,
-                    one.verdict,
-                    {
-                        "map": one.map_index,
-                        "bar_m": one.bar_m,
-                        "within_m": one.within_m,
-                        "error_95_m": one.error_95_m,
-                        "good_share": one.good_share,
-                        **{f"drive_{number}": text for number, text in enumerate(one.drives, 1)},
-                    },
-                )
-                for one in maps
-            ]
-            self._diagnose(FLEET_QUALITY, now_ns, statuses)
+        statuses = [
+            self._status(
+                f"map {one.map_index}",
+                robot,
+                self._levels.WARN if one.drives else self._levels.OK,
+                one.verdict,
+                {
+                    "map": one.map_index,
+                    "bar_m": one.bar_m,
+                    "within_m": one.within_m,
+                    "error_95_m": one.error_95_m,
+                    "good_share": one.good_share,
+                    **{f"drive_{number}": text for number, text in enumerate(one.drives, 1)},
+                },
+            )
+            for one in maps
+        ]
+        self._diagnose(FLEET_QUALITY, now_ns, statuses, LATCHED)
 
     def offer_points(self) -> None:
         """Begin the topic of ``points``, so that others find it."""
-        with self._lock:
-            self._begin(POINTS, POINT_CLOUD, LATCHED)
+        self._publisher(POINTS, POINT_CLOUD, LATCHED)
 
     def points(self, stamp_ns: int, points: FloatArray) -> None:
         """Publish the points (N, 3) of the map in space."""
@@ -164,65 +159,40 @@ class Outputs:
             data=np.frombuffer(points.astype("<f4").tobytes(), np.uint8),
             is_dense=True,
         )
-        with self._lock:
-            self._begin(POINTS, POINT_CLOUD, LATCHED)
-            self._send(POINTS, POINT_CLOUD, message)
+        self._send(POINTS, POINT_CLOUD, message, LATCHED)
 
     def map(self, stamp_ns: int, occupancy: OccupancyMap, topic: str = MAP) -> bool:
         """Publish a map if it changed; returns whether it did."""
-        with self._lock:
-            self._begin(topic, GRID, LATCHED)
-            before = self._maps.get(topic)
-            if before is not None and _is_same(before, occupancy):
-                return False
-            self._maps[topic] = occupancy
-            self._send(topic, GRID, self._grid_message(stamp_ns, occupancy))
-            return True
+        before = self._maps.get(topic)
+        if before is not None and _is_same(before, occupancy):
+            return False
+        self._maps[topic] = occupancy
+        self._send(topic, GRID, self._grid_message(stamp_ns, occupancy), LATCHED)
+        return True
 
-    def fleet(
-        self,
-        now_ns: int,
-        teammates: "Sequence[TeammatePose]",
-        own: int | None,
-    ) -> None:
+    def fleet(self, now_ns: int, teammates: "Sequence[TeammatePose]", own: int | None) -> None:
         """Publish where the robots of the own map are, and which of all robots, this one as well, are in which map.
 
         ``own`` is the index of the robot's own map; None: no pose is in its frame.
         """
-        make, frame = self._codec.make, self._map_frame
-        with self._lock:
-            self._begin(FLEET_POSES, POSES, STREAMED)
-            self._begin(FLEET_STATUS, DIAGNOSTICS, STREAMED)
-            near = [mate for mate in teammates if mate.map_index == own]
-            poses = [self._codec.pose(in_space(np.array(mate.T_map_base))) for mate in near]
-            self._send(FLEET_POSES, POSES, make(POSES, header=self._codec.header(now_ns, frame), poses=poses))
-            for mate in near:
-                topic = f"fleet/{_topic_name(mate.robot)}/pose"
-                if topic not in self._teammates and len(self._teammates) >= MOST_TEAMMATES:
-                    continue
-                self._teammates.add(topic)
-                self._begin(topic, POSE_STAMPED, STREAMED)
-                stamp_ns = max(0, now_ns - nanoseconds(mate.age_s))
-                self._send(topic, POSE_STAMPED, self._posed(stamp_ns, np.array(mate.T_map_base)))
-            statuses = [
-                self._status(
-                    f"robot {mate.robot}",
-                    mate.robot,
-                    self._levels.OK,
-                    f"map {mate.map_index}",
-                    {
-                        "map": mate.map_index,
-                        "floor": mate.floor,
-                        "age_s": f"{mate.age_s:.2f}",
-                        **{
-                            axis: f"{value:.4f}"
-                            for axis, value in zip(("x", "y", "theta"), mate.T_map_base, strict=True)
-                        },
-                    },
-                )
-                for mate in teammates
-            ]
-            self._diagnose(FLEET_STATUS, now_ns, statuses)
+        near = [mate for mate in teammates if mate.map_index == own]
+        poses = [self._codec.pose(in_space(np.array(mate.T_map_base))) for mate in near]
+        header = self._codec.header(now_ns, self._map_frame)
+        self._send(FLEET_POSES, POSES, self._codec.make(POSES, header=header, poses=poses))
+        for mate in near:
+            topic = f"fleet/{_topic_name(mate.robot)}/pose"
+            if topic not in self._teammates and len(self._teammates) >= MOST_TEAMMATES:
+                continue
+            self._teammates.add(topic)
+            stamp_ns = max(0, now_ns - nanoseconds(mate.age_s))
+            self._send(topic, POSE_STAMPED, self._posed(stamp_ns, np.array(mate.T_map_base)))
+        statuses = []
+        for mate in teammates:
+            values: dict[str, object] = {"map": mate.map_index, "floor": mate.floor, "age_s": f"{mate.age_s:.2f}"}
+            values |= {axis: f"{at:.4f}" for axis, at in zip(("x", "y", "theta"), mate.T_map_base, strict=True)}
+            name, where = f"robot {mate.robot}", f"map {mate.map_index}"
+            statuses.append(self._status(name, mate.robot, self._levels.OK, where, values))
+        self._diagnose(FLEET_STATUS, now_ns, statuses)
 
     def event(self, stamp_ns: int, robot: str, text: str) -> None:
         """Publish one event of the fleet's map on the topic of diagnostics."""
@@ -240,25 +210,21 @@ class Outputs:
     def _status(self, name: str, hardware: str, level: int, message: str, values: Mapping[str, object]) -> Any:
         make = self._codec.make
         pairs = [make("diagnostic_msgs/KeyValue", key=key, value=str(value)) for key, value in values.items()]
-        return make(
-            STATUS,
-            level=level,
-            name=name,
-            message=message,
-            hardware_id=hardware,
-            values=pairs,
-        )
+        return make(STATUS, level=level, name=name, message=message, hardware_id=hardware, values=pairs)
 
-    def _diagnose(self, topic: str, stamp_ns: int, statuses: Sequence[Any]) -> None:
+    def _diagnose(self, topic: str, stamp_ns: int, statuses: Sequence[Any], quality: Quality = STREAMED) -> None:
         header = self._codec.header(stamp_ns, "")
-        self._send(topic, DIAGNOSTICS, self._codec.make(DIAGNOSTICS, header=header, status=statuses))
+        self._send(topic, DIAGNOSTICS, self._codec.make(DIAGNOSTICS, header=header, status=statuses), quality)
 
-    def _begin(self, topic: str, kind: str, quality: Quality) -> None:
-        if topic not in self._publishers:
-            self._publishers[topic] = self._network.publisher(resolved(self._namespace, topic), kind, quality)
+    def _publisher(self, topic: str, kind: str, quality: Quality) -> Publish:
+        with self._lock:
+            if topic not in self._publishers:
+                self._publishers[topic] = self._network.publisher(resolved(self._namespace, topic), kind, quality)
+            return self._publishers[topic]
 
-    def _send(self, topic: str, kind: str, message: Any) -> None:
-        self._publishers[topic](self._codec.encode(message, kind))
+    def _send(self, topic: str, kind: str, message: Any, quality: Quality = STREAMED) -> None:
+        """Publish a message; the first one on a topic begins it."""
+        self._publisher(topic, kind, quality)(self._codec.encode(message, kind))
 
     def _marker(
         self,

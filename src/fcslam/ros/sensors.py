@@ -12,14 +12,13 @@ from fcslam.records import CloudScan, SensorRecord
 from fcslam.ros.live_plan import LivePlan, LivePlanner, Notify
 from fcslam.ros.topics import SensorTopics
 from fcslam.sources.bags.census import BagMessage
-from fcslam.sources.bags.clocks import FEWEST_LAGS
 from fcslam.sources.bags.codec import IMAGE
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.fixes import FixReader
 from fcslam.sources.bags.messages import ScanMessage
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.pairing import MAX_GAP_S, Item, PosedImage, PosedScan
-from fcslam.sources.bags.plan import clock_ahead
+from fcslam.sources.bags.plan import FEWEST_LAGS, clock_ahead
 from fcslam.sources.bags.reader import CloudStream, Numbered, SensorReader
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import MAX_STEP_BACK_S

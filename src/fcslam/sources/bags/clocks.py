@@ -2,14 +2,12 @@
 
 from array import array
 from collections.abc import Sequence
-from statistics import median, quantiles
+from statistics import median
 from typing import Any
 
 from fcslam.sources.bags.codec import NANOSECONDS
 from fcslam.sources.bags.messages import stamp_ns_of
-from fcslam.sources.gate import FIRST_MESSAGES, MAX_STEP_BACK_S
-
-FEWEST_LAGS = 4
+from fcslam.sources.gate import FIRST_MESSAGES
 
 
 class StampClock:
@@ -45,20 +43,3 @@ def restamped(content: Any, now_ns: int, lag_ns: int) -> Any:
     if not lag_ns or isinstance(content, ValueError) or content.stamp != now_ns / NANOSECONDS:
         return content
     return content._replace(stamp=(now_ns - lag_ns) / NANOSECONDS)
-
-
-def clock_ahead_s(scans_s: Sequence[float], others_s: Sequence[float]) -> float:
-    """How far a clock is ahead of that of the scans, by the times from measuring to recording with both.
-
-    It is 0 if they differ by little, if one varies, or if there are too few.
-    """
-    usual_s = []
-    for lags_s in (scans_s, others_s):
-        if len(lags_s) < FEWEST_LAGS:
-            return 0.0
-        low_s, middle_s, high_s = quantiles(lags_s, n=4)
-        if high_s - low_s > MAX_STEP_BACK_S:
-            return 0.0
-        usual_s.append(middle_s)
-    ahead_s = usual_s[0] - usual_s[1]
-    return ahead_s if abs(ahead_s) >= MAX_STEP_BACK_S else 0.0

@@ -1,17 +1,18 @@
 """Decides once, before the messages of a robot are read, which of its topics and frames are read, and how."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import chain, islice, pairwise
-from math import dist, tau
+from math import degrees, dist, inf, radians, tau
+from statistics import quantiles
 from typing import Final, NamedTuple
 
 from fcslam.config import one_line
 from fcslam.errors import InputError, SourceError
 from fcslam.geometry import se2
-from fcslam.records import CameraModel, Sweep
+from fcslam.records import LaserModel, Sweep
 from fcslam.sources.bags.camera import Calibration, image_of
 from fcslam.sources.bags.census import BagMessage, Messages, valid
-from fcslam.sources.bags.clocks import clock_ahead_s
 from fcslam.sources.bags.cloud_scans import CloudScans, calibration_in
 from fcslam.sources.bags.codec import FIX, IMU, LASER_SCANS, NANOSECONDS, ODOMETRY
 from fcslam.sources.bags.container import Topic
@@ -20,21 +21,24 @@ from fcslam.sources.bags.imu import ImuReader
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage, odometry_in
 from fcslam.sources.bags.options import NO_ODOMETRY, UNCORRECTED, BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Item
-from fcslam.sources.bags.rig import RecordedLaser, Rig, mounted_camera, mountings_of, recorded_laser, rig_of, tilt_note
+from fcslam.sources.bags.rig import RecordedLaser, Rig, mountings_of, recorded_laser, turned_beams
 from fcslam.sources.bags.robots import BagRobot, listed, usual
 from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
-from fcslam.sources.bags.transforms import Link, Mounting, TransformTree, is_corrected
+from fcslam.sources.bags.transforms import Link, Mounting, NoTransformError, TransformTree, is_corrected
 from fcslam.sources.contradictions import CHANGED, changed_share
 from fcslam.sources.faults import Audit
-from fcslam.sources.gate import FIRST_MESSAGES
+from fcslam.sources.gate import FIRST_MESSAGES, MAX_STEP_BACK_S
 from fcslam.sources.motion import LARGEST_SPEED
 from fcslam.sources.path_summary import fault_of_odometry, without_odometry
 from fcslam.sources.returns import is_apart
 
 USUAL_ODOM: Final = "odom"
 """Frame of an odometry that names none."""
+_LEVEL_RAD = radians(2.0)
 _STRIDE = 5
 """Every fifth scan is compared to see whether the robot moves."""
+FEWEST_LAGS: Final = 4
+"""Messages that show a clock."""
 EACH_LASER: Final = "give one for each laser, in the same order"
 
 
@@ -137,15 +141,26 @@ class BagPlan(NamedTuple):
             _moved(mounted, options.correction) for mounted in mountings_of(self.lasers, self.tree, base_frame, poses)
         ]
         notes = [
-            f"the laser of {laser.name} is {tilt}"
+            f"the laser of {laser.name} is tilted by {degrees(mounted.tilt_rad):.1f} degrees, read as level"
             for laser, mounted in zip(self.lasers, mountings, strict=True)
-            if (tilt := tilt_note(mounted))
+            if mounted.tilt_rad > _LEVEL_RAD
         ]
-        camera: CameraModel | None = None
-        if self.topics.camera is not None:
-            camera, note = mounted_camera(self.calibration, self.tree, base_frame)
-            notes += [f"the camera of {self.topics.camera.name} {note}"] if note else []
-        return rig_of(self.lasers, farthest_m, mountings, camera), notes
+        lasers = tuple(
+            LaserModel(*turned_beams(laser.first.beams, mounted.upside_down), range_max_m, mounted.T_base_laser)
+            for laser, range_max_m, mounted in zip(self.lasers, farthest_m, mountings, strict=True)
+        )
+        camera, note, its = None, "", self.calibration
+        if its is not None:
+            note = "has distorted images, read as if they were not" * its.is_distorted
+            try:
+                camera = replace(its.camera, T_base_camera=self.tree.fixed(base_frame, its.frame))
+            except NoTransformError as error:
+                note = f"is left out, as tf has {error}"
+        elif self.topics.camera is not None:
+            note = "was never calibrated, it is left out"
+        if note and self.topics.camera is not None:
+            notes.append(f"the camera of {self.topics.camera.name} {note}")
+        return Rig(lasers, tuple(mounted.upside_down for mounted in mountings), camera), notes
 
 
 def plan_of(robot: BagRobot, options: BagOptions, topics: Topics | None = None) -> BagPlan:
@@ -160,11 +175,16 @@ def plan_of(robot: BagRobot, options: BagOptions, topics: Topics | None = None) 
 
 def clock_ahead(bag: Messages, laser: RecordedLaser, name: str, lags_s: Sequence[float]) -> tuple[float, str]:
     """How far the clock of the sensor ``name`` with these lags is ahead of that of the scans, which are stamped before
-    they end, and a line that says it; 0 and empty if they agree.
+    they end, and a line that says it. It is 0 if they differ by little, if one varies, or if there are few messages.
     """
-    scans_s = [lag_s - laser.first.duration_s for lag_s in bag.census[laser.topic].clock.lags_s]
-    ahead_s = clock_ahead_s(scans_s, lags_s)
-    if not ahead_s:
+    usual_s = []
+    for each_s in ([lag_s - laser.first.duration_s for lag_s in bag.census[laser.topic].clock.lags_s], lags_s):
+        low_s, middle_s, high_s = quantiles(each_s, n=4) if len(each_s) >= FEWEST_LAGS else (0.0, 0.0, inf)
+        if high_s - low_s > MAX_STEP_BACK_S:
+            return 0.0, ""
+        usual_s.append(middle_s)
+    ahead_s = usual_s[0] - usual_s[1]
+    if abs(ahead_s) < MAX_STEP_BACK_S:
         return 0.0, ""
     said = f"{ahead_s:.3f} s ahead of that of the scans by the times of recording; corrected"
     return ahead_s, f"{bag.label}the clock of {name} is {said}"

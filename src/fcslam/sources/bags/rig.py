@@ -10,7 +10,7 @@ import numpy as np
 
 from fcslam.errors import InputError
 from fcslam.records import Beams, CameraImage, CameraModel, LaserModel, LaserScan, frozen
-from fcslam.sources.bags.camera import Calibration, check_image
+from fcslam.sources.bags.camera import check_image
 from fcslam.sources.bags.codec import LASER_SCANS
 from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.messages import UNKNOWN_RANGE_M, ScanMessage, measured_ranges, reversed_sweep
@@ -21,7 +21,6 @@ from fcslam.sources.bags.transforms import Mounting, NoTransformError, Transform
 from fcslam.sources.gate import usual_beams
 from fcslam.sources.point_clouds import CloudBand
 
-_LEVEL_RAD = radians(2.0)
 _STEEPEST_RAD = radians(10.0)
 FARTHEST_SENSOR_M = 10.0
 """Largest distance of a sensor from the base of a robot; a pose in millimetres or centimetres says more."""
@@ -72,7 +71,7 @@ class Rig(NamedTuple):
             scan = scan._replace(raw_ranges_m=scan.ranges_at_stamp(scan.sweep), sweep=None)
         ranges_m = measured_ranges(scan)
         ranges_m = frozen(ranges_m[::-1] if upside_down else ranges_m, np.float32)
-        laser = self.lasers[scan.laser].with_beams(_turned_beams(scan.beams, upside_down))
+        laser = self.lasers[scan.laser].with_beams(turned_beams(scan.beams, upside_down))
         sweep = reversed_sweep(scan.sweep) if upside_down else scan.sweep
         return LaserScan(scan.stamp, ranges_m, laser, frozen(posed.T_odom_base), sweep, gyro=posed.gyro)
 
@@ -100,20 +99,6 @@ def recorded_laser(topic: Topic, first: Sequence[ScanMessage], frame: str | None
     turns = joined_turns(first) if is_in_sectors else first
     usual = usual_beams([scan.beams for scan in turns])
     return RecordedLaser(topic, next(scan for scan in turns if scan.beams == usual), is_in_sectors, frame)
-
-
-def rig_of(
-    recorded: Sequence[RecordedLaser],
-    ranges_max_m: Sequence[float],
-    mountings: Sequence[Mounting],
-    camera: CameraModel | None,
-) -> Rig:
-    """The rig of these lasers with these largest ranges and mountings."""
-    lasers = tuple(
-        LaserModel(*_turned_beams(laser.first.beams, mounted.upside_down), range_max_m, mounted.T_base_laser)
-        for laser, range_max_m, mounted in zip(recorded, ranges_max_m, mountings, strict=True)
-    )
-    return Rig(lasers, tuple(mounted.upside_down for mounted in mountings), camera)
 
 
 def mountings_of(
@@ -162,25 +147,6 @@ def _mounting_in(tree: TransformTree, base_frame: str, laser: RecordedLaser) -> 
     return mounted
 
 
-def tilt_note(mounted: Mounting) -> str:
-    """How much a laser is tilted; empty for a level one."""
-    if mounted.tilt_rad <= _LEVEL_RAD:
-        return ""
-    return f"tilted by {degrees(mounted.tilt_rad):.1f} degrees, read as level"
-
-
-def mounted_camera(
-    calibration: Calibration | None, tree: TransformTree, base_frame: str
-) -> tuple[CameraModel | None, str]:
-    """The camera with its calibration and mounting, and a note about it; without them it is left out."""
-    if calibration is None:
-        return None, "was never calibrated, it is left out"
-    try:
-        camera = replace(calibration.camera, T_base_camera=tree.fixed(base_frame, calibration.frame))
-    except NoTransformError as error:
-        return None, f"is left out, as tf has {error}"
-    return camera, "has distorted images, read as if they were not" if calibration.is_distorted else ""
-
-
-def _turned_beams(beams: Beams, upside_down: bool) -> Beams:
+def turned_beams(beams: Beams, upside_down: bool) -> Beams:
+    """The beams as they are seen from above."""
     return beams._replace(angle_min_rad=-(beams.angle_min_rad + beams.span_rad)) if upside_down else beams
