@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from fcslam.geometry import se2
+from fcslam.geometry import se2, se3
+from fcslam.geometry.groups import SE3
 from fcslam.graph.optimizer import PosePrior, optimize
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.maps.certificate import (
@@ -111,6 +112,20 @@ def test_a_map_that_an_exact_plan_bent_is_as_good_as_before():
     bent = poses * (1.02, 1.0, 1.0)
     before, after = covariances(graph, [path(poses)]), covariances(PoseGraph(bent, graph.edges), [path(bent)], graph)
     assert after.bend_m(10.0).mean() == pytest.approx(before.bend_m(10.0).mean(), rel=0.05)
+
+
+def test_a_ramp_is_no_contradiction():
+    pitch_rad = np.where(np.arange(COUNT) < COUNT // 2, 0.0, -0.2)  # up from the middle on
+    turns = np.stack((0 * pitch_rad, np.sin(pitch_rad / 2), 0 * pitch_rad, np.cos(pitch_rad / 2)), axis=-1)
+    steps = np.stack((np.cos(pitch_rad), 0 * pitch_rad, -np.sin(pitch_rad)), axis=-1)
+    poses = np.concatenate((np.cumsum(steps, axis=0), turns), axis=-1)
+    information = np.diag((1e4, 1e4, 1e4, 2.5e5, 2.5e5, 2.5e5))
+    edges = [Edge(i, i + 1, se3.between(poses[i], poses[i + 1]), information, False) for i in range(COUNT - 1)]
+    space = PoseGraph(poses, edges, SE3)
+    flat = space.to_plane()
+    paths = [path(flat.poses())]
+    assert covariances(flat, paths, space).scale == pytest.approx(QUIET, rel=1e-3)
+    assert covariances(flat, paths).scale.max() > 1.5 * QUIET
 
 
 def bend_of(poses, truth, within_m):
