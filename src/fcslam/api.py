@@ -148,8 +148,7 @@ def localize(
             map is beside it, as ``map_before``; poses and other cells stay.
 
     Returns:
-        A run whose trajectory has the localized scans; ``localized`` has every scan with standard deviations and
-            quality.
+        A run whose trajectory has the localized scans; ``localized`` has every scan, with its quality.
 
     Raises:
         InputError: the recording, the map, the pose, the floor, the configuration or the output folder cannot be used.

@@ -168,14 +168,11 @@ class LocalizedRobot(LiveTracker):
         self._is_finished = True
 
     def save(self, folder: StrPath, force: bool = False) -> Run:
-        """Write a run folder, as ``fcslam localize`` does: the poses that ``add_scan`` returned.
+        """Write a run folder of the poses that ``add_scan`` returned, as ``fcslam localize`` does, and return the run.
 
         Args:
             folder: the folder to make.
             force: replace a run that is there.
-
-        Returns:
-            The run that was written.
         """
         prepare_output(Path(folder), force)
         with self._lock:

@@ -369,15 +369,12 @@ class Robot(LiveTracker):
             self._wait_once(watch)
 
     def save(self, folder: StrPath, force: bool = False) -> Run:
-        """Write a run folder of the robot's own map, as ``fcslam map`` does; after ``finish`` it is the same as for a
-        recording.
+        """Write a run folder of the robot's own map, as ``fcslam map`` does, and return the run; after ``finish`` it is
+        the same as for a recording.
 
         Args:
             folder: the folder to make.
             force: replace a run that is there.
-
-        Returns:
-            The run that was written.
         """
         own = self._require_own_map()
         prepare_output(Path(folder), force)

@@ -91,7 +91,7 @@ class LiveTracker(ABC):
     def add_scan(
         self, ranges_m: ArrayLike, stamp: float, odometry: ArrayLike | None = None, laser: str = ""
     ) -> RobotPose:
-        """Localize the next scan.
+        """Localize the next scan, and return its pose.
 
         Args:
             ranges_m: metres, one for each beam. NaN, negative, or at least ``max_range_m``: invalid; inf: no return,
@@ -102,9 +102,6 @@ class LiveTracker(ABC):
                 not matter. None for all scans: there is no odometry, and scan matching alone gives the motion; an event
                 says where the scans do not determine it.
             laser: which one, if there are several.
-
-        Returns:
-            Where the robot is.
 
         Raises:
             InputError: the ranges do not fit the laser, the clock went back by more than 2 s, a number cannot be used,

@@ -95,8 +95,7 @@ class Run(RunTables):
 
     @cached_property
     def verdict(self) -> tuple[MapVerdict, ...]:
-        """The verdict on each map, in the order of their numbers: ``str`` of one gives its sentence. Computed at the
-        first use."""
+        """The verdict on each map, by number; ``str`` of one is its sentence. Computed at the first use."""
         return verdicts(self, self.quality)
 
     def save(self, folder: StrPath, force: bool = False) -> None:
