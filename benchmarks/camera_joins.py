@@ -1,10 +1,12 @@
 """How far robots drive until they share a map by camera places alone, with one detector after another.
 
     python benchmarks/camera_joins.py --fleets FOLDER --weights detector.onnx [--test 411 ...] [--keep ROWS.jsonl]
+    python benchmarks/camera_joins.py --fleets FOLDER --building corridor --test 411 412 413
 
 The unseen buildings of `benchmarks/closure_learning.py`, which records them into FOLDER and trains the networks: three
 robots, 45 m each, drive at the same time, each in other light, and half of the furniture moves. Mapped with the
-bundled network and with each one that --weights names.
+bundled network, with each one that --weights names, and with ORB. In another --building they have LiDAR places as
+well, and LiDAR places alone stand beside: in the corridor, whose doors are alike, these tell places apart worst.
 
 Driven: path of a robot in its own map until it shares a map with another robot for good; of a robot that never does,
 its whole path. The row of a building has the median over its robots. Differences to the bundled network are building by
@@ -21,7 +23,9 @@ import numpy as np
 from closure_learning import ROBOTS, TEST, recorded
 
 from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector
+from fcslam.features.detector_kinds import DetectorKind
 from fcslam.lab.evaluation.report import evaluate_fleet
+from fcslam.lab.simulation.options import Building
 from fcslam.metrics.bootstrap import mean_interval
 from fcslam.mission.mission import MissionCloud, MissionConfig, run_mission
 from fcslam.records import Channel, ClosureStatus, FloatArray
@@ -55,27 +59,38 @@ def main() -> None:
     parser = common.options(__doc__ or "")
     parser.add_argument("--fleets", type=Path, required=True, help="folder of recordings; those missing are made there")
     parser.add_argument("--test", nargs="+", type=int, default=TEST, help="seeds of the buildings")
+    parser.add_argument(
+        "--building", type=Building, choices=Building, default=Building.DEFAULT, help="kind of building"
+    )
     parser.add_argument("--weights", nargs="+", type=Path, default=[], help="networks beside the bundled one")
     parser.add_argument("--keep", type=Path, help="file that keeps finished buildings; the same one resumes")
     chosen = parser.parse_args()
     kept = common.Kept(chosen.keep)
     report = common.Report(__file__, __doc__ or "", chosen)
-    networks = {OnnxDetector(OnnxConfig(weights=path)).version: path for path in (BUNDLED_NETWORK, *chosen.weights)}
+    own = () if chosen.building is Building.DEFAULT else (Channel.LIDAR,)
+    robots = {
+        OnnxDetector(OnnxConfig(weights=path)).version: RobotConfig(
+            channels=(*own, Channel.CAMERA), views=ViewsConfig(weights=path)
+        )
+        for path in (BUNDLED_NETWORK, *chosen.weights)
+    }
+    robots["orb"] = RobotConfig(channels=(*own, Channel.CAMERA), views=ViewsConfig(detector=DetectorKind.ORB))
+    if own:
+        robots["LiDAR alone"] = RobotConfig(channels=own)
     rows: list[tuple] = []
-    for name, path in networks.items():
-        for seed in chosen.test:
-            rows += kept.rows((name, seed), partial(mapped, name, path, seed, chosen.fleets))
-    report.table("Summary", SUMMARY, summary(rows, list(networks)))
+    for seed in chosen.test:
+        folder = recorded(seed, len(ROBOTS), chosen.fleets, chosen.building)
+        for name, robot in robots.items():
+            rows += kept.rows((name, folder.name), partial(mapped, name, robot, folder, seed))
+    report.table("Summary", SUMMARY, summary(rows, list(robots)))
     report.table("Buildings", ROWS, rows)
     report.write()
 
 
-def mapped(name: str, network: Path, seed: int, fleets: Path) -> list[tuple]:
-    """One building with one network."""
-    folder, watch = recorded(seed, len(ROBOTS), fleets), JoinWatch()
-    views = ViewsConfig(weights=network)
-    config = MissionConfig(robot=RobotConfig(channels=(Channel.CAMERA,), views=views))
-    run = run_mission([open_source(folder / robot, name=robot) for robot in ROBOTS], config, live=watch)
+def mapped(name: str, robot: RobotConfig, folder: Path, seed: int) -> list[tuple]:
+    """One building with one detector."""
+    watch, sources = JoinWatch(), [open_source(folder / each, name=each) for each in ROBOTS]
+    run = run_mission(sources, MissionConfig(robot=robot), live=watch)
     paths = {robot: path_m(run.local_maps[robot].T_local_base) for robot in ROBOTS}
     with tempfile.TemporaryDirectory() as place:
         run.save(Path(place), force=True)

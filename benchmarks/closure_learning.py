@@ -56,7 +56,7 @@ from fcslam.features.codes import mutual_matches
 from fcslam.features.detector import BUNDLED_NETWORK, FeatureDetector, OnnxConfig, OnnxDetector, decode_grey
 from fcslam.features.lidar_depth import LidarView
 from fcslam.geometry import se2
-from fcslam.lab.simulation.options import Lighting
+from fcslam.lab.simulation.options import Building, Lighting
 from fcslam.lab.simulation.recording import prepare_fleet_folder, record_robot
 from fcslam.lab.simulation.simulated_fleet import CameraSettings, SimulationSettings, simulate_fleet
 from fcslam.learning.code_batches import STEP_POINTS, RevisitExamples, RevisitPair
@@ -207,12 +207,14 @@ def examples_row(seed: int, fleet: Fleet) -> tuple:
     return seed, sum(len(learner.keyframes) for learner in learners), own, len(fleet.together.pairs) - own
 
 
-def recorded(seed: int, robots: int, folder: Path) -> Path:
+def recorded(seed: int, robots: int, folder: Path, building: Building = Building.DEFAULT) -> Path:
     """The recordings of one building; what is there already is not made again."""
+    camera = CameraSettings(rate_hz=2.0)
     settings = SimulationSettings(
-        robots=robots, path_length_m=45.0, lighting=LIGHT, moved_furniture=0.5, camera=CameraSettings(rate_hz=2.0)
+        building=building, robots=robots, path_length_m=45.0, lighting=LIGHT, moved_furniture=0.5, camera=camera
     )
-    place, part = folder / str(seed), folder / f"{seed}.part"
+    name = str(seed) if building is Building.DEFAULT else f"{building}-{seed}"
+    place, part = folder / name, folder / f"{name}.part"
     if not place.exists():
         shutil.rmtree(part, ignore_errors=True)
         prepare_fleet_folder(part, settings, seed)
