@@ -182,24 +182,14 @@ def _without_collection() -> Iterator[None]:
 
 
 def _watch(display: "ProgressDisplay", total: int, faults: "dict[str, Faults]") -> "Callable[[Progress], None]":
-    began = time.perf_counter()
-
     def watch(now: "Progress") -> None:
-        speed = _speed(now.recorded_s, time.perf_counter() - began)
-        counts = f"{sum(now.closures.values())} closures", f"{now.keyscans} keyscans"
-        display.show("mapping", now.scans, total, ", ".join([*speed, *counts]))
+        counts = f"{sum(now.closures.values())} closures, {now.keyscans} keyscans"
+        display.show("mapping", now.scans, total, counts)
         faults.update(now.faults)
         if now.fusing:
             display.start("fusing")
 
     return watch
-
-
-def _speed(recorded_s: float, elapsed_s: float) -> list[str]:
-    if not recorded_s > 0.0 < elapsed_s:
-        return []
-    speed = recorded_s / elapsed_s
-    return [f"{speed:.{0 if speed >= 10.0 else 1}f} x real time"]
 
 
 def _report(
@@ -224,7 +214,8 @@ def _report(
             str(len(trajectory.stamps)),
         )
     answers().print(table)
-    speed = "".join(f" ({text})" for text in _speed(values["recorded_time"], elapsed_s))
+    recorded_s = values["recorded_time"]
+    speed = f" ({recorded_s / elapsed_s:.3g} x real time)" if recorded_s > 0.0 < elapsed_s else ""
     typer.echo(
         f"{values['scans']:.0f} scans in {elapsed_s:.1f} s{speed}, "
         f"{values['intra_robot_closures_accepted']:.0f} closures within robots, "

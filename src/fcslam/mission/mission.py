@@ -63,8 +63,6 @@ class Progress:
 
     scans: int
     keyscans: int
-    recorded_s: float
-    """Recorded time so far, summed over the robots, in seconds."""
     closures: dict[str, int]
     fusing: bool = False
     """Whether all packets are sent, and the cloud decides and fuses."""
@@ -204,7 +202,6 @@ class _Meter:
     def __init__(self, watch: Watch, cloud: MissionCloud, robots: Sequence[str]) -> None:
         self._watch = watch
         self._cloud = cloud
-        self._span: dict[str, tuple[float, float]] = {}
         self._faults: dict[str, Faults] = {}
         self.scans = self.keyscans = 0
         self._tracks: dict[str, dict[str, Track]] = {robot: {} for robot in robots}
@@ -216,16 +213,8 @@ class _Meter:
         by_robot = (sorted(robot.items(), key=lambda item: robot_and_epoch(item[0])) for robot in self._tracks.values())
         return dict(itertools.chain.from_iterable(by_robot))
 
-    @property
-    def recorded_s(self) -> float:
-        """Time between the first and the last scan of each recording, together."""
-        return sum(last - first for first, last in self._span.values())
-
     def count(self, leg: Leg) -> None:
         """One more leg of a robot."""
-        if leg.stamps and (leg.robot in self._span or not leg.tracks):  # what was recorded before comes as one leg
-            first, last = self._span.get(leg.robot, (leg.stamps[0], leg.stamps[0]))
-            self._span[leg.robot] = min(first, *leg.stamps), max(last, *leg.stamps)
         self.scans += len(leg.stamps)
         self.keyscans += leg.keyscans
         if leg.faults is None:
@@ -237,7 +226,7 @@ class _Meter:
     def report(self, fusing: bool = False) -> None:
         """Report the progress now."""
         closures = self._cloud.host.fleet.closure_counts()
-        self._watch(Progress(self.scans, self.keyscans, self.recorded_s, closures, fusing, self._faults.copy()))
+        self._watch(Progress(self.scans, self.keyscans, closures, fusing, self._faults.copy()))
 
 
 def check_robots(sources: Sequence[Source]) -> None:
