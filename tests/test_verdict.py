@@ -43,7 +43,7 @@ def test_a_good_map_has_no_concern_and_says_what_that_rests_on():
     assert verdict.details == (
         "joined: a and b: 12 closures from 5 places; 140 m of wall seen by both, 0.3 m (0.2 %) contradict; "
         "elsewhere the maps fit 0.10 times as well",
-        "accurate to 3 cm within 10 m, unless wheels slipped unseen in a bare corridor",
+        "accurate to 3 cm within 10 m",
         "2 m2 are known",
     )
 

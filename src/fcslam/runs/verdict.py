@@ -187,7 +187,6 @@ def _facts(certificate: Mapping[str, Any] | None) -> tuple[str, str]:
     if certificate is None or certificate.get("error_95") is None:
         return "", ""
     accuracy = f"accurate to {_centimetres(max(0.01, certificate['error_95']))} within {certificate['within']:g} m"
-    accuracy += ", unless wheels slipped unseen in a bare corridor"
     coverage, ends = f"{len(certificate['cells'])} m2 are known", certificate.get("open_ends", [])
     if ends:
         at = _place((ends[0]["x"], ends[0]["y"]))
