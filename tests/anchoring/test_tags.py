@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from fcslam.anchoring.anchors import Anchors, anchored, anchoring_lines
+from fcslam.anchoring.part import ROUNDS, Positions, part_of
 from fcslam.anchoring.surveyed_tags import read_survey
 from fcslam.cloud.report import fuse_members
 from fcslam.errors import SourceError
@@ -44,6 +45,19 @@ def placed(result, seen, survey=None, by_hand=()):
 
 def lines(placing):
     return list(anchoring_lines(placing.files))
+
+
+def test_points_that_a_robot_sees_show_its_heading():
+    result, true = mapped(drift_rad=0.05)
+    part, (robot,) = part_of(result, 0), result.robots
+    arms = np.tile(((4.0, 0.0), (0.0, 3.0)), (len(true), 1))
+    numbers = np.repeat(np.arange(len(true)), 2)
+    at = se2.compose(true[numbers], np.column_stack((arms, np.zeros(len(arms)))))[:, :2]
+    positions = Positions(robot.variables[numbers], arms, at, np.full(len(arms), 1e-3))
+    poses = se2.compose(se2.compose(true[0], se2.inverse(robot.T_map_base[0])), part.graph.poses())
+    for _ in range(ROUNDS):
+        poses = positions.solved(part.graph, poses)
+    np.testing.assert_allclose(se2.between(true, poses[robot.variables]), 0.0, atol=1e-3)
 
 
 def test_surveyed_tags_place_a_map_and_straighten_it():

@@ -9,7 +9,6 @@ from fcslam.sources.bags.codec import (
     FIX,
     IMAGE,
     IMU,
-    MULTI_ECHO_SCAN,
     ODOMETRY,
     SCAN,
     TRANSFORMS,
@@ -32,17 +31,6 @@ def scan(stamp, ranges, frame="laser", angle_min=-math.pi / 2, increment=math.pi
         angle_increment=increment, time_increment=beam_s, scan_time=max(0.1, beam_s * len(ranges)), range_min=0.1,
         range_max=range_max, ranges=ranges, intensities=np.zeros(0, np.float32),
     )  # fmt: skip
-
-
-def multi_echo(stamp, ranges):
-    """A scan whose beams have a second echo a metre behind; none at 0."""
-    single = scan(stamp, ranges)
-    beams = [
-        CODEC.make("sensor_msgs/LaserEcho", echoes=np.array([r, r + 1.0] if r else [], np.float32)) for r in ranges
-    ]
-    names = ("header", "angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min")
-    fields = {name: getattr(single, name) for name in (*names, "range_max")}
-    return CODEC.make(MULTI_ECHO_SCAN, **fields, ranges=beams, intensities=[])
 
 
 def odometry(stamp, pose, frame="odom", child="base_link"):

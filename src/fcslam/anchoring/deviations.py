@@ -87,24 +87,17 @@ class _Wall:
         _, vectors = np.linalg.eigh(self.normals.T @ self.normals)
         return np.asarray(vectors[:, 1])
 
-    def along(self, tangent: FloatArray) -> tuple[float, float]:
-        """First and last coordinate along a direction."""
-        at = self.points @ tangent
+    def along(self, normal: FloatArray) -> tuple[float, float]:
+        """First and last coordinate along walls with this normal."""
+        at = self.points @ (-normal[1], normal[0])
         return float(at.min()), float(at.max())
 
-    @property
-    def length_m(self) -> float:
-        """Length of the wall."""
-        start, end = self.ends()
-        return math.dist(start, end)
-
-    def ends(self) -> tuple[tuple[float, float], tuple[float, float]]:
+    def deviation(self, kind: DeviationKind, by_m: float | None = None) -> Deviation:
+        """The wall as a deviation of this kind."""
         normal = self.normal
-        tangent = np.array((-normal[1], normal[0]))
-        first, last = self.along(tangent)
-        across = float(np.median(self.points @ normal))
-        start, end = across * normal + first * tangent, across * normal + last * tangent
-        return (float(start[0]), float(start[1])), (float(end[0]), float(end[1]))
+        across = float(np.median(self.points @ normal)) * normal
+        (x0, y0), (x1, y1) = (across + at * np.array((-normal[1], normal[0])) for at in self.along(normal))
+        return Deviation(kind, (float(x0), float(y0)), (float(x1), float(y1)), by_m)
 
 
 def compare_with_plan(plan: Submap, building: Submap) -> Comparison:
@@ -122,11 +115,10 @@ def compare_with_plan(plan: Submap, building: Submap) -> Comparison:
         if match is not None:
             taken.add(match[0])
         by_m = wall.off_m if wall.off_m is not None else match[1] if match is not None else None
-        kind = DeviationKind.MISSING if by_m is None else DeviationKind.MOVED
-        found.append(Deviation(kind, *wall.ends(), by_m))
-    for wall in (wall for k, wall in enumerate(new) if k not in taken and wall.length_m >= SHORTEST_NEW_M):
-        found.append(Deviation(DeviationKind.NEW, *wall.ends()))
-    kept = [deviation for deviation in found if deviation.length_m >= SHORTEST_M]
+        found.append(wall.deviation(DeviationKind.MISSING if by_m is None else DeviationKind.MOVED, by_m))
+    found += [wall.deviation(DeviationKind.NEW) for k, wall in enumerate(new) if k not in taken]
+    least_m = {DeviationKind.NEW: SHORTEST_NEW_M}
+    kept = [deviation for deviation in found if deviation.length_m >= least_m.get(deviation.kind, SHORTEST_M)]
     kept.sort(key=lambda deviation: (-deviation.length_m, deviation.start))
     mean_off_m = float(np.abs(across[confirmed]).mean()) if confirmed.any() else float("nan")
     return Comparison(tuple(kept), SPACING_M * int(confirmed.sum()), mean_off_m)
@@ -187,11 +179,10 @@ def _walls(points: FloatArray, normals: FloatArray, across: FloatArray, chosen: 
 
 def _moved(wall: _Wall, others: Sequence[_Wall], farthest_m: float) -> tuple[int, float] | None:
     normal = wall.normal
-    tangent = np.array((-normal[1], normal[0]))
-    first, last = wall.along(tangent)
+    first, last = wall.along(normal)
     best: tuple[int, float] | None = None
     for number, other in enumerate(others):
-        low, high = other.along(tangent)
+        low, high = other.along(normal)
         overlap = min(last, high) - max(first, low)
         if abs(float(other.normal @ normal)) < PARALLEL or overlap < 0.5 * min(last - first, SHORTEST_M):
             continue

@@ -66,6 +66,8 @@ class Georeference:
 class _Measured(Positions):
     """Positions of antennas, metres east and north."""
 
+    spread: float
+    """Factor by which correlation in time enlarges the standard deviations."""
     factor: float = 1.0
     """Factor by which the standard deviations are larger than stated."""
 
@@ -98,23 +100,22 @@ def georeferenced(part: MapPart, is_fixed: bool) -> Georeference | None:
         np.array([fix.antenna_xy for fix in kept]),
         east_north,
         np.maximum(LEAST_SIGMA_M, stated_m),
+        max(1.0, CORRELATED_S / max(interval_s, 1e-3)) ** 0.5,
     )
-    # Correlation in time enlarges the standard deviations.
-    spread = max(1.0, CORRELATED_S / max(interval_s, 1e-3)) ** 0.5
     poses = part.graph.poses()
     antennas = measured.points(poses)
     measured, T, agreeing = _vote(measured, antennas)
-    refusal = _refusal(measured, T, antennas, agreeing, spread)
+    refusal = _refusal(measured, T, antennas, agreeing)
     if refusal or agreeing.mean() < 1.0 / CLEARLY_MORE:
         count = int(agreeing.sum())
-        if explanation := _explanation(measured, antennas, positions, 0 if refusal else count, spread):
+        if explanation := _explanation(measured, antennas, positions, 0 if refusal else count):
             refusal = f"{refusal or f'{count} of {len(agreeing)} fixes agree'}; {explanation}"
     sigma_m = float(np.median(measured.sigma_m))
     sigmas_m = sigma_m, float(np.median(stated_m)) if measured.factor > 1.0 else sigma_m
     if refusal:
         return Georeference(part, len(kept), int((~agreeing).sum()), refusal, *sigmas_m)
     if not is_fixed:
-        poses, agreeing = _solve(part.graph, se2.compose(T, poses), measured, agreeing, spread)
+        poses, agreeing = _solve(part.graph, se2.compose(T, poses), measured, agreeing)
         part, T = part.at(poses), np.zeros(3)
     longitude, latitude = projection(*T[:2].tolist(), inverse=True)
     ignored = int((~agreeing).sum())
@@ -167,9 +168,7 @@ def _needed(count: int) -> int:
     return max(LEAST_FIXES, round(LEAST_SHARE * count))
 
 
-def _refusal(
-    measured: _Measured, T: FloatArray, antennas: FloatArray, agreeing: NDArray[np.bool_], spread: float
-) -> str:
+def _refusal(measured: _Measured, T: FloatArray, antennas: FloatArray, agreeing: NDArray[np.bool_]) -> str:
     count, sigmas_m = int(agreeing.sum()), measured.sigma_m
     if count < _needed(len(agreeing)):
         return f"{count} of {len(agreeing)} fixes agree, {_needed(len(agreeing))} needed"
@@ -177,10 +176,10 @@ def _refusal(
         return f"the fixes differ by {np.median(sigmas_m):.1f} m from the path of the robots"
     at = measured.xy[agreeing] - measured.xy[agreeing].mean(axis=0)
     sigma_m = float(np.sqrt(np.mean(sigmas_m[agreeing] ** 2)))
-    if len(agreeing) >= LEAST_INDEPENDENT * spread**2:  # they may be better than they state, too
+    if len(agreeing) >= LEAST_INDEPENDENT * measured.spread**2:  # they may be better than they state, too
         off_m = (measured.off(se2.transform(T, antennas)) * sigmas_m)[agreeing]
         sigma_m = min(sigma_m, float(np.sqrt(0.5 * np.mean(off_m**2))))
-    turn_rad = spread * sigma_m / max(1e-9, float(np.sqrt((at**2).sum())))
+    turn_rad = measured.spread * sigma_m / max(1e-9, float(np.sqrt((at**2).sum())))
     if turn_rad > MOST_TURN_RAD:
         return (
             f"the fixes fix the map's heading to {np.degrees(turn_rad):.1f} deg only, "
@@ -189,7 +188,7 @@ def _refusal(
     return ""
 
 
-def _explanation(measured: _Measured, antennas: FloatArray, positions: FloatArray, count: int, spread: float) -> str:
+def _explanation(measured: _Measured, antennas: FloatArray, positions: FloatArray, count: int) -> str:
     """With which change of the coordinates clearly more than ``count`` fixes agree; empty if with none."""
     stated = replace(measured, sigma_m=measured.sigma_m / measured.factor, factor=1.0)
     size = np.hypot(*measured.xy.std(axis=0)) / np.hypot(*antennas.std(axis=0))
@@ -203,15 +202,15 @@ def _explanation(measured: _Measured, antennas: FloatArray, positions: FloatArra
             changed[name] = _projected(each)[1]
     for name, east_north in reversed(changed.items()):
         its, T, agreeing = _vote(replace(stated, xy=east_north), antennas)
-        if agreeing.sum() > CLEARLY_MORE * count and not _refusal(its, T, antennas, agreeing, spread):
+        if agreeing.sum() > CLEARLY_MORE * count and not _refusal(its, T, antennas, agreeing):
             return f"with {name}, {agreeing.sum()} of {len(agreeing)} agree: correct the driver of the receiver"
     return ""
 
 
 def _solve(
-    graph: PoseGraph, poses: FloatArray, measured: _Measured, agreeing: NDArray[np.bool_], spread: float
+    graph: PoseGraph, poses: FloatArray, measured: _Measured, agreeing: NDArray[np.bool_]
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    spreading = replace(measured, sigma_m=spread * measured.sigma_m)
+    spreading = replace(measured, sigma_m=measured.spread * measured.sigma_m)
     for _ in range(ROUNDS):
         poses = spreading.solved(graph, poses, agreeing)
         before, agreeing = agreeing, measured.off(measured.points(poses)) < OUTLIER

@@ -145,6 +145,8 @@ class BagMessage(NamedTuple):
 
     def by_clock(self, lag_ns: int) -> "BagMessage":
         """The same, read by a clock of the topic that is so far behind that of recording, if it has no stamp."""
+        if not lag_ns:
+            return self
         is_converted = self.topic.type in _KEPT
         decoded = restamped(self.decoded, self.bag_time_ns, lag_ns) if is_converted else self.decoded
         return self._replace(unstamped_ns=self.bag_time_ns - lag_ns, decoded=decoded)

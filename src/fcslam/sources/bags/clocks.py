@@ -40,6 +40,6 @@ def restamped(content: Any, now_ns: int, lag_ns: int) -> Any:
     """The content of a message by the clock of its topic: a stamp that is the time of recording was zero."""
     if isinstance(content, list):
         return [restamped(each, now_ns, lag_ns) for each in content]
-    if not lag_ns or isinstance(content, ValueError) or content.stamp != now_ns / NANOSECONDS:
+    if isinstance(content, ValueError) or content.stamp != now_ns / NANOSECONDS:
         return content
     return content._replace(stamp=(now_ns - lag_ns) / NANOSECONDS)

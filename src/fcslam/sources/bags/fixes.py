@@ -9,7 +9,7 @@ from fcslam.records import GnssFix
 from fcslam.sources.bags.census import BagMessage
 from fcslam.sources.bags.messages import header_of
 from fcslam.sources.bags.rig import FARTHEST_SENSOR_M
-from fcslam.sources.bags.transforms import NoTransformError, TransformTree, mounting
+from fcslam.sources.bags.transforms import NoTransformError, TransformTree, planar
 from fcslam.sources.faults import Audit, Fault
 
 SIGMA_M: Final = {0: 5.0, 1: 2.0, 2: 0.5}
@@ -33,7 +33,7 @@ class FixReader:
     def read(self, message: BagMessage) -> Iterator[GnssFix]:
         """The fix in the next message, if there is one; it is left out if it comes soon after the one before."""
         try:
-            found = fix_of(message.content, message.unstamped_ns, self._tree, self._base_frame)
+            found = self._fix(message.content, message.unstamped_ns)
         except ValueError:
             found = Fault.BROKEN_MESSAGE
         if isinstance(found, Fault):
@@ -45,42 +45,34 @@ class FixReader:
             self._used_s = found.stamp
             yield replace(found, stamp=found.stamp - self._ahead_s)
 
+    def _fix(self, content: Any, unstamped_ns: int) -> GnssFix | Fault:
+        """Convert a message, or say what it lacks; a status that is not known counts as a fix.
 
-def fix_of(content: Any, bag_time_ns: int, tree: TransformTree, base_frame: str) -> GnssFix | Fault:
-    """Convert a message, or say what it lacks; a status that is not known counts as a fix.
+        Latitude and longitude 0 are a fault: the receiver has no fix, and does not say so.
+        """
+        latitude, longitude, altitude = float(content.latitude), float(content.longitude), float(content.altitude)
+        if content.status.status == NO_FIX:
+            return Fault.NO_FIX
+        if latitude == 0.0 == longitude:
+            return Fault.FIX_AT_ZERO
+        if abs(latitude) > 90.0:
+            return Fault.NO_LATITUDE
+        if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):  # false for NaN
+            raise ValueError(f"latitude {latitude:g}, longitude {longitude:g} are not a position on the earth")
+        stamp, frame = header_of(content.header, unstamped_ns)
+        east2, north2 = float(content.position_covariance[0]), float(content.position_covariance[4])
+        sigma_m = SIGMA_M.get(int(content.status.status), SIGMA_M[0])
+        if content.position_covariance_type and min(east2, north2) > 0.0 and max(east2, north2) < LARGEST_SIGMA_M**2:
+            sigma_m = (0.5 * (east2 + north2)) ** 0.5
+        altitude_m = altitude if math.isfinite(altitude) else 0.0
+        return GnssFix(stamp, latitude, longitude, altitude_m, sigma_m, self._antenna(frame))
 
-    Latitude and longitude 0 are a fault: the receiver has no fix, and does not say so.
-    """
-    if content.status.status == NO_FIX:
-        return Fault.NO_FIX
-    latitude, longitude, altitude = float(content.latitude), float(content.longitude), float(content.altitude)
-    if latitude == 0.0 == longitude:
-        return Fault.FIX_AT_ZERO
-    if abs(latitude) > 90.0:
-        return Fault.NO_LATITUDE
-    if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):  # false for NaN
-        raise ValueError(f"latitude {latitude:g}, longitude {longitude:g} are not a position on the earth")
-    stamp, frame = header_of(content.header, bag_time_ns)
-    east2, north2 = float(content.position_covariance[0]), float(content.position_covariance[4])
-    sigma_m = SIGMA_M.get(int(content.status.status), SIGMA_M[0])
-    if content.position_covariance_type and 0.0 < east2 < LARGEST_SIGMA_M**2 and 0.0 < north2 < LARGEST_SIGMA_M**2:
-        sigma_m = (0.5 * (east2 + north2)) ** 0.5
-    return GnssFix(
-        stamp,
-        latitude,
-        longitude,
-        altitude if math.isfinite(altitude) else 0.0,
-        sigma_m,
-        _antenna(tree, base_frame, frame),
-    )
-
-
-def _antenna(tree: TransformTree, base_frame: str, frame: str) -> tuple[float, float]:
-    """Where tf says that the antenna sits; in the middle of the robot if it does not."""
-    try:
-        x, y, _ = mounting(tree.fixed(base_frame, frame)).T_base_laser
-    except NoTransformError:
-        return 0.0, 0.0
-    if not math.hypot(x, y) <= FARTHEST_SENSOR_M:
-        raise ValueError(f"the antenna is {math.hypot(x, y):g} m from the robot")
-    return x, y
+    def _antenna(self, frame: str) -> tuple[float, float]:
+        """Where tf says that the antenna sits; in the middle of the robot if it does not."""
+        try:
+            x, y, _ = planar(self._tree.fixed(self._base_frame, frame))
+        except NoTransformError:
+            return 0.0, 0.0
+        if not math.hypot(x, y) <= FARTHEST_SENSOR_M:
+            raise ValueError(f"the antenna is {math.hypot(x, y):g} m from the robot")
+        return x, y
