@@ -112,5 +112,5 @@ setInterval(async () => {
 // A hidden page has no stream.
 if (!report) document.addEventListener("visibilitychange", () => { if (document.hidden) pause(); else open(); });
 readTheme();
-show(asked.view && at(`view-${asked.view}`) ? asked.view : asked.view === "map" || matchMedia("(max-width: 700px)").matches ? "map" : "fleet");
+show(asked.view && at(`view-${asked.view}`) ? asked.view : asked.view === "map" ? "map" : "fleet");  // with the verdict
 open();
