@@ -127,7 +127,7 @@ class LivePlanner:
         self.is_without_odometry = options.odom_topic == NO_ODOMETRY
         self._options, self._notify = options, notify
         scans, transforms, odometry, camera, info = (
-            tuple(self.messages.by_name[name] for name in names if name)
+            tuple(self.messages.by_name[name] for name in names if name and name in topics.kinds)
             for names in (topics.scans, topics.transforms, (topics.odometry,), (topics.camera,), (topics.camera_info,))
         )
         self._odometry = next(iter(odometry), None)
