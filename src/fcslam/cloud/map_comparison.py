@@ -13,8 +13,7 @@ from fcslam.graph.cluster import MayDecide, local_frames, relative_frame
 from fcslam.graph.consistency import Closures
 from fcslam.graph.evidence import AGREES_M, AGREES_RAD, LARGEST_CONTRADICTION, LEAD, MapFit, refutation
 from fcslam.graph.trajectory import Trajectory
-from fcslam.lidar.map_agreement import PlaceAgreement
-from fcslam.places.local_maps import LocalMaps, SeenKeyscans
+from fcslam.places.local_maps import SessionMaps, agreement
 from fcslam.records import FloatArray, frozen
 from fcslam.storage.snapshot import Kept
 
@@ -25,6 +24,8 @@ factor twice."""
 MOST_TRANSFORMS = 5
 """Comparisons of two sessions that are kept, at different transforms."""
 
+SESSIONS_KEPT = 10
+"""Sessions whose local maps are kept, 4 MB each."""
 RIVALS = 2
 """Transforms elsewhere at which local maps are compared: those with the best scores."""
 
@@ -61,6 +62,8 @@ class MapComparison(Kept):
         self._sessions, self._space = sessions, space
         self._compared: dict[frozenset[str], list[_Compared]] = {}
         """The last comparisons of each pair of sessions, one for each transform: later, places may be forgotten."""
+        self._maps: dict[str, SessionMaps] = {}
+        """Of the sessions that were compared last; a re-evaluation compares each with several others."""
 
     def fit(
         self,
@@ -122,29 +125,33 @@ class MapComparison(Kept):
         # SciPy's transforms take as long to load as a hundred scans, and most missions compare no maps.
         from fcslam.lidar.uniqueness import align_map, alignments, parallel_headings
 
-        group, local_maps = group_of(a.poses), self._local_maps(sessions, a.poses, b.poses)
-        near_a, i, is_complete_a = local_maps.around(0, a.poses[members.i, : group.axes].mean(axis=0))
-        near_b, j, is_complete_b = local_maps.around(1, b.poses[members.j, : group.axes].mean(axis=0))
+        group, maps_a, maps_b = (
+            group_of(a.poses),
+            self._maps_of(sessions[0], a.poses),
+            self._maps_of(sessions[1], b.poses),
+        )
+        near_a, i, is_complete_a = maps_a.around(a.poses[members.i, : group.axes].mean(axis=0))
+        near_b, j, is_complete_b = maps_b.around(b.poses[members.j, : group.axes].mean(axis=0))
         keyscans = min(len(near_a), len(near_b))
         if earlier and not (is_complete_a and is_complete_b) and earlier.keyscans > keyscans:
             return replace(earlier, closures=len(members), size=len(a) + len(b))
         if not keyscans:
             return None
         frames, T_a_i, T_b_j = local_frames(a, b, members), a.poses[i], b.poses[j]
-        T_i_j, fit = _between(T_a_i, T_a_b, T_b_j), _fit(local_maps.agreement(frames))
+        T_i_j, fit = _between(T_a_i, T_a_b, T_b_j), _fit(maps_a, maps_b, frames)
         if refutation(fit) is None:
             fit = replace(fit, seen_through=self._space.seen_through(sessions, a.poses, b.poses, frames))
         is_searched = refutation(fit) is not None  # then no transform elsewhere matters
         if not is_searched and may_decide(fit):
             is_searched = True
-            whole_a, whole_b = local_maps.whole(0, near_a, i), local_maps.whole(1, near_b, j)
+            whole_a, whole_b = maps_a.whole(near_a, i), maps_b.whole(near_b, j)
             best = align_map(whole_a, whole_b, T_i_j)
             fit = replace(fit, seen_m=best.known_m)
             found_elsewhere = alignments(whole_a, whole_b, best.T_a_b, parallel_headings(whole_a, whole_b))
             for rival in (each for each in found_elsewhere[:RIVALS] if each.score_m > 0.0):
                 T = group.compose(group.compose(T_a_i, group.from_plane(rival.T_a_b)), group.inverse(T_b_j))
                 # Two places that look alike may both fit badly; the better one is more likely.
-                found = _fit(local_maps.agreement(np.broadcast_to(T, b.poses.shape)))
+                found = _fit(maps_a, maps_b, np.broadcast_to(T, b.poses.shape))
                 if found.support > fit.rival_support and found.contradiction <= LARGEST_CONTRADICTION:
                     fit = replace(fit, rival_support=found.support)
         return _Compared(i, j, frozen(T_i_j), keyscans, len(members), len(a) + len(b), fit, is_searched)
@@ -152,7 +159,7 @@ class MapComparison(Kept):
     def at(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> MapFit:
         """Compare the walls of two sessions at poses (N, P) of their keyscans in the frame of one map."""
         identity = np.broadcast_to(group_of(poses_b).identity, poses_b.shape)
-        return _fit(self._local_maps(sessions, poses_a, poses_b).agreement(identity))
+        return _fit(self._maps_of(sessions[0], poses_a), self._maps_of(sessions[1], poses_b), identity)
 
     def seen_m(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> float:
         """As in ``MapFit``, at poses (N, P) in the frame of one map, around where the paths come nearest."""
@@ -160,23 +167,29 @@ class MapComparison(Kept):
 
         from fcslam.lidar.uniqueness import align_map
 
-        local_maps, group = self._local_maps(sessions, poses_a, poses_b), group_of(poses_a)
+        maps_a, maps_b = self._maps_of(sessions[0], poses_a), self._maps_of(sessions[1], poses_b)
+        group = group_of(poses_a)
         apart_m, _ = cKDTree(poses_a[:, : group.axes]).query(poses_b[:, : group.axes])
         middle = poses_b[np.argmin(apart_m), : group.axes]
-        (near_a, i, _), (near_b, j, _) = local_maps.around(0, middle), local_maps.around(1, middle)
+        (near_a, i, _), (near_b, j, _) = maps_a.around(middle), maps_b.around(middle)
         if not len(near_a) or not len(near_b):
             return 0.0
-        whole_a, whole_b = local_maps.whole(0, near_a, i), local_maps.whole(1, near_b, j)
+        whole_a, whole_b = maps_a.whole(near_a, i), maps_b.whole(near_b, j)
         return align_map(whole_a, whole_b, _between(poses_a[i], group.identity, poses_b[j])).known_m
 
-    def _local_maps(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> LocalMaps:
-        store = self._sessions
-        a, b = (SeenKeyscans(store.numbers(session), partial(store.scan, session)) for session in sessions)
-        return LocalMaps((a, b), (poses_a, poses_b), (AGREES_M, AGREES_RAD))
+    def _maps_of(self, session: str, poses: FloatArray) -> SessionMaps:
+        """The local maps of a session whose keyscans have these poses (N, P): the kept ones if nothing has changed."""
+        numbers, kept = self._sessions.numbers(session), self._maps.pop(session, None)
+        if kept is None or not np.array_equal(kept.poses, poses) or not np.array_equal(kept.numbers, numbers):
+            kept = SessionMaps(numbers, partial(self._sessions.scan, session), poses)
+        if len(self._maps) >= SESSIONS_KEPT:
+            del self._maps[next(iter(self._maps))]
+        self._maps[session] = kept
+        return kept
 
 
-def _fit(agreement: PlaceAgreement) -> MapFit:
-    support, expected, compared_m, contradicting_m = agreement
+def _fit(a: SessionMaps, b: SessionMaps, T_a_b: FloatArray) -> MapFit:
+    support, expected, compared_m, contradicting_m = agreement(a, b, T_a_b, (AGREES_M, AGREES_RAD))
     return MapFit(support, expected, -np.inf, compared_m, contradicting_m)
 
 

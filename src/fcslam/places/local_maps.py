@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from fcslam.geometry import se2
 from fcslam.geometry.groups import group_of
 from fcslam.lidar.map_agreement import LocalSubmap, Noise, PlaceAgreement, compare, local_map, noise_of, total
 from fcslam.lidar.scan import PointScan
-from fcslam.lidar.submap import Submap, build_submap
+from fcslam.lidar.submap import Located, Submap, build_submap
 from fcslam.records import FloatArray
 
 REACH_M = 45.0
@@ -33,107 +32,91 @@ MOST_LOCAL_MAPS = 16
 """Most places at which local maps are compared; of more, evenly spaced ones."""
 
 
-class SeenKeyscans(NamedTuple):
-    """The keyscans of a session that are left."""
+class SessionMaps:
+    """Local maps of one session, each of which is built once."""
 
-    numbers: NDArray[np.int64]
-    """Shape (K,), ascending."""
-    scan: Callable[[int], PointScan]
-    """The points of one of them."""
+    def __init__(self, numbers: NDArray[np.int64], scan: Callable[[int], PointScan], poses: FloatArray) -> None:
+        """``numbers`` (K,) of the keyscans that are left, ascending; ``scan`` gives the points of one of them.
 
-
-class LocalMaps:
-    """Local maps of two sessions around separate places of the second one's path, which are built once."""
-
-    def __init__(
-        self,
-        seen: tuple[SeenKeyscans, SeenKeyscans],
-        poses: tuple[FloatArray, FloatArray],
-        drift: tuple[float, float],
-    ) -> None:
-        """``poses`` (N, P) of all keyscans of both sessions, each in its own frame, metres and radians.
-
-        ``drift``: largest error of a transform between both at one place, metres and radians.
+        ``poses`` (N, P) of all keyscans in one frame, metres and radians.
         """
-        self._seen, self._drift, self._group = seen, drift, group_of(poses[0])
-        self._poses, self._in_plane = poses, [self._group.to_plane(side) for side in poses]
-        self._built: dict[tuple[int, int], LocalSubmap | None] = {}
+        self.numbers, self.poses, self.group = numbers, poses, group_of(poses)
+        self._scan, self._in_plane = scan, self.group.to_plane(poses)
+        self._built: dict[int, LocalSubmap | None] = {}
 
     @cached_property
-    def _places(self) -> NDArray[np.int64]:
-        return _separate(self._positions(self._poses[1]), PLACES_APART_M)
+    def places(self) -> NDArray[np.int64]:
+        """Keyscans of separate places along the path, shape (M,)."""
+        return _separate(self.positions(self.poses), PLACES_APART_M)
 
-    def _positions(self, poses: FloatArray) -> FloatArray:
+    def positions(self, poses: FloatArray) -> FloatArray:
         """Positions (N, A) in which two floors lie as far apart as two places."""
-        return poses[:, : self._group.axes] * (1.0, 1.0, LOCAL_RADIUS_M / SAME_FLOOR_M)[: self._group.axes]
+        return poses[:, : self.group.axes] * (1.0, 1.0, LOCAL_RADIUS_M / SAME_FLOOR_M)[: self.group.axes]
 
-    def around(self, side: int, middle: FloatArray) -> tuple[NDArray[np.int64], int, bool]:
-        """The keyscans of a session that are left around a point (A,), the nearest one, and whether none was released
-        there."""
-        distance_m = self._distance_m(side, middle)
-        keyscans = self._keyscans(side, middle, REACH_M, MOST_KEYSCANS)
+    def around(self, middle: FloatArray) -> tuple[NDArray[np.int64], int, bool]:
+        """The keyscans that are left around a point (A,), the nearest one, and whether none was released there."""
+        distance_m = self._distance_m(middle)
+        keyscans = self._keyscans(middle, REACH_M, MOST_KEYSCANS)
         is_complete = len(keyscans) >= min(MOST_KEYSCANS, int(np.count_nonzero(distance_m <= REACH_M)))
         nearest = int(keyscans[np.argmin(distance_m[keyscans])]) if len(keyscans) else -1
         return keyscans, nearest, is_complete
 
-    def whole(self, side: int, keyscans: NDArray[np.int64], anchor: int) -> Submap:
+    def whole(self, keyscans: NDArray[np.int64], anchor: int) -> Submap:
         """The map of keyscans ``around`` a point, in the base of one of them."""
-        return build_submap(self._scans(side, keyscans, anchor), REACH_M)
+        return build_submap(self._scans(keyscans, anchor), REACH_M)
 
-    def _scans(self, side: int, keyscans: NDArray[np.int64], anchor: int) -> list[tuple[PointScan, FloatArray]]:
-        poses = se2.between(self._in_plane[side][anchor], self._in_plane[side][keyscans])
-        return [(self._seen[side].scan(k), pose) for k, pose in zip(keyscans.tolist(), poses, strict=True)]
+    def at(self, row: int) -> LocalSubmap | None:
+        """The local map around a keyscan, in its base; None if too few keyscans are left there."""
+        if row not in self._built:
+            keyscans = self._keyscans(self.poses[row, : self.group.axes], LOCAL_M, MOST_LOCAL_KEYSCANS)
+            scans = self._scans(keyscans, row)
+            self._built[row] = local_map(scans, LOCAL_RADIUS_M) if len(scans) >= FEWEST_LOCAL_KEYSCANS else None
+        return self._built[row]
 
-    def _distance_m(self, side: int, middle: FloatArray) -> FloatArray:
-        off = self._poses[side][:, : self._group.axes] - middle
+    def _scans(self, keyscans: NDArray[np.int64], anchor: int) -> list[Located]:
+        poses = se2.between(self._in_plane[anchor], self._in_plane[keyscans])
+        return [(self._scan(k), pose) for k, pose in zip(keyscans.tolist(), poses, strict=True)]
+
+    def _distance_m(self, middle: FloatArray) -> FloatArray:
+        off = self.poses[:, : self.group.axes] - middle
         is_on_floor = np.all(np.abs(off[:, 2:]) < SAME_FLOOR_M, axis=1)
         return np.where(is_on_floor, np.hypot(off[:, 0], off[:, 1]), np.inf)
 
-    def _keyscans(self, side: int, middle: FloatArray, reach_m: float, most: int) -> NDArray[np.int64]:
-        numbers = self._seen[side].numbers
-        return _at_most(numbers[self._distance_m(side, middle)[numbers] <= reach_m], most)
+    def _keyscans(self, middle: FloatArray, reach_m: float, most: int) -> NDArray[np.int64]:
+        return _at_most(self.numbers[self._distance_m(middle)[self.numbers] <= reach_m], most)
 
-    def agreement(self, T_a_b: FloatArray) -> PlaceAgreement:
-        """Compare the local maps of both sessions wherever the first one was near a place of the second.
 
-        ``T_a_b`` between their frames at each keyscan of b, shape (N, P), metres and radians; NaN: not known.
-        """
-        from scipy.spatial import cKDTree
+def agreement(a: SessionMaps, b: SessionMaps, T_a_b: FloatArray, drift: tuple[float, float]) -> PlaceAgreement:
+    """Compare the local maps of two sessions wherever the first one was near a place of the second.
 
-        from fcslam.lidar.uniqueness import align_map
+    ``T_a_b`` between their frames at each keyscan of b, shape (N, P), metres and radians; NaN: not known. ``drift``:
+    its largest error at one place, metres and radians.
+    """
+    from scipy.spatial import cKDTree
 
-        poses_a, poses_b = self._poses
-        places = [row for row in self._places if np.isfinite(T_a_b[row, 0])]
-        in_a = self._group.compose(T_a_b[places], poses_b[places])
-        tree = cKDTree(self._positions(poses_a))
-        found_m, found_rows = tree.query(self._positions(in_a), distance_upper_bound=LOCAL_RADIUS_M)
-        nearest = np.asarray(found_rows)
-        # Paths that never come near each other may have seen the same walls from two sides.
-        reach_m = LOCAL_M if np.any(found_m <= LOCAL_M) else LOCAL_RADIUS_M
-        near = _at_most(np.flatnonzero(found_m <= reach_m), MOST_LOCAL_MAPS)
-        maps = [(self._at(0, int(nearest[k])), self._at(1, int(places[k]))) for k in near]
-        noises = [noise_of(filter(None, side)) for side in zip(*maps, strict=True)]
-        noise = Noise(*map(max, zip(*noises, strict=True))) if noises else Noise()
-        agreements = []
-        for k, (map_a, map_b) in zip(near, maps, strict=True):
-            if map_a is None or map_b is None:
-                continue
-            T_i_j = self._group.to_plane(self._group.between(poses_a[nearest[k]], in_a[k]))
-            aligned = align_map(map_a.submap, map_b.submap, T_i_j).T_a_b
-            off = se2.between(T_i_j, aligned)
-            # Farther off, another wall is the nearest one.
-            is_near = np.hypot(off[0], off[1]) < self._drift[0] and abs(off[2]) < self._drift[1]
-            agreements.append(compare(map_a, map_b, aligned if is_near else T_i_j, noise))
-        return total(agreements)
+    from fcslam.lidar.uniqueness import align_map
 
-    def _at(self, side: int, row: int) -> LocalSubmap | None:
-        if (side, row) not in self._built:
-            middle = self._poses[side][row, : self._group.axes]
-            keyscans = self._keyscans(side, middle, LOCAL_M, MOST_LOCAL_KEYSCANS)
-            scans = self._scans(side, keyscans, row)
-            is_enough = len(scans) >= FEWEST_LOCAL_KEYSCANS
-            self._built[side, row] = local_map(scans, LOCAL_RADIUS_M) if is_enough else None
-        return self._built[side, row]
+    places = [row for row in b.places if np.isfinite(T_a_b[row, 0])]
+    in_a = b.group.compose(T_a_b[places], b.poses[places])
+    found_m, found_rows = cKDTree(a.positions(a.poses)).query(a.positions(in_a), distance_upper_bound=LOCAL_RADIUS_M)
+    nearest = np.asarray(found_rows)
+    # Paths that never come near each other may have seen the same walls from two sides.
+    reach_m = LOCAL_M if np.any(found_m <= LOCAL_M) else LOCAL_RADIUS_M
+    near = _at_most(np.flatnonzero(found_m <= reach_m), MOST_LOCAL_MAPS)
+    maps = [(a.at(int(nearest[k])), b.at(int(places[k]))) for k in near]
+    noises = [noise_of(filter(None, side)) for side in zip(*maps, strict=True)]
+    noise = Noise(*map(max, zip(*noises, strict=True))) if noises else Noise()
+    agreements = []
+    for k, (map_a, map_b) in zip(near, maps, strict=True):
+        if map_a is None or map_b is None:
+            continue
+        T_i_j = a.group.to_plane(a.group.between(a.poses[nearest[k]], in_a[k]))
+        aligned = align_map(map_a.submap, map_b.submap, T_i_j).T_a_b
+        off = se2.between(T_i_j, aligned)
+        # Farther off, another wall is the nearest one.
+        is_near = np.hypot(off[0], off[1]) < drift[0] and abs(off[2]) < drift[1]
+        agreements.append(compare(map_a, map_b, aligned if is_near else T_i_j, noise))
+    return total(agreements)
 
 
 def _separate(positions: FloatArray, apart_m: float) -> NDArray[np.int64]:
