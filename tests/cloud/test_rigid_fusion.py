@@ -187,6 +187,14 @@ def test_a_place_seen_again_is_no_second_point(pairs):
     assert {c.status for c in fused.closures} == {ClosureStatus.VERIFIED}
 
 
+@pytest.mark.parametrize("far_m", [1e12, 1e15, 1e17])
+def test_a_robot_that_claims_to_be_far_away_does_not_end_the_fusion(far_m):
+    """Its points are one to a computer, so nothing aligns them."""
+    fused = fuse_rigidly(ledger_of(closures(A, B, MEETINGS)), own_maps(a=(0, 0, 0), b=(far_m, 0, 0)))
+    assert sorted(robot for robots in fused.maps for robot in robots) == ["a", "b"]
+    assert all(np.isfinite(poses).all() for poses in fused.T_map_base.values())
+
+
 def test_the_two_most_similar_points_that_lie_apart_decide_which_matches_agree():
     """The most similar two lie beside each other. The first two to arrive are the least similar, and false."""
     lines = [*closures(A, B, [(0, 0), (8, 8)], shift=ALIAS), *closures(A, B, [(16, 16), (16, 16), (24, 24)])]

@@ -21,7 +21,7 @@ import numpy as np
 from fcslam.cloud.closure_log import ClosureEntry
 from fcslam.cloud.result import Fusion
 from fcslam.geometry import se2
-from fcslam.geometry.alignment import n_point_alignment, two_point_alignment
+from fcslam.geometry.alignment import n_point_alignment
 from fcslam.graph.evidence import DISTINCT_RAD
 from fcslam.graph.joint import merge
 from fcslam.records import ClosureStatus, FloatArray, LoopClosure, Reason, ReasonCode, frozen
@@ -50,7 +50,7 @@ def fuse_rigidly(closures: Iterable[ClosureEntry], T_local_base: Mapping[str, Fl
     frames, maps = [se2.IDENTITY for _ in order], list(range(len(order)))
     used: dict[ClosureEntry, Reason] = {}
     for robots, members in _links(valid, T_local_base).items():
-        T_a_b = n_point_alignment(*np.stack([poses[:, :2] for _, poses in members], axis=1))
+        T_a_b = _aligned(members)
         if np.isfinite(T_a_b).all() and merge(frames, maps, order.index(robots[0]), order.index(robots[1]), T_a_b):
             used |= {entry: Reason(ReasonCode.MATCHED_POINT, len(members)) for entry, _ in members}
     T_map_base: dict[str, FloatArray] = {
@@ -84,14 +84,17 @@ def _links(
 
 def _agreeing(matches: Sequence[_Match], two: tuple[_Match, _Match]) -> list[_Match]:
     """The matches that the alignment of two of them lays on each other; these two may each be off by ``EQUAL_M``."""
-    try:
-        T_a_b = two_point_alignment(*np.stack([poses[:, :2] for _, poses in two], axis=1))
-    except ValueError:  # a robot claims to be so far away that its two points are one to a computer
-        return list(two)
+    T_a_b = _aligned(two)
     poses = np.stack([poses for _, poses in matches])
     off = se2.between(poses[:, 0], se2.compose(T_a_b, poses[:, 1]))
     agree = (np.hypot(off[:, 0], off[:, 1]) <= 2.0 * EQUAL_M) & (np.abs(off[:, 2]) < DISTINCT_RAD)
-    return [match for match, fits in zip(matches, agree, strict=True) if fits]
+    # None agrees if a robot claims to be so far away that its two points are one to a computer.
+    return [match for match, fits in zip(matches, agree, strict=True) if fits] or list(two)
+
+
+def _aligned(matches: Sequence[_Match]) -> FloatArray:
+    """``T_a_b`` by least squares over matched points: of two points, eqs. (5) and (6). NaN if the points are one."""
+    return n_point_alignment(*np.stack([poses[:, :2] for _, poses in matches], axis=1))
 
 
 def _are_valid(poses: FloatArray, others: FloatArray) -> bool:
