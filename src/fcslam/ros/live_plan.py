@@ -27,8 +27,9 @@ PATIENCE_S: Final = 5.0
 calibration."""
 _LONGEST_WAIT: Final = 10_000
 """Most first messages that wait for the plan."""
+_LARGE: Final = (*CLOUDS, IMAGE)
 _MOST_LARGE: Final = 100
-"""Most of them that are clouds or depth images."""
+"""Most clouds or depth images of a topic among them."""
 
 Notify = Callable[[str], None]
 """Takes one line for the user; what repeats a line is not said again."""
@@ -80,9 +81,8 @@ class FirstMessages(Messages):
         """Keep one of the first messages for the plan."""
         self._kept.append(message)
         self.counts[message.topic] += 1
-        large = [at for at, each in enumerate(self._kept) if each.topic.type in (*CLOUDS, IMAGE)]
-        if len(large) > _MOST_LARGE:
-            del self._kept[large[0]]
+        if message.topic.type in _LARGE and self.counts[message.topic] > _MOST_LARGE:
+            del self._kept[next(at for at, each in enumerate(self._kept) if each.topic == message.topic)]
 
     def read(self, topics: Collection[Topic]) -> Iterator[BagMessage]:
         """As in ``Messages``."""
