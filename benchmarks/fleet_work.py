@@ -49,7 +49,7 @@ def count(owner, name, label):
 count(matcher, "propose_motions", "places compared")
 count(verification, "align", "verified")
 count(comparison.MapComparison, "_compare", "maps compared")
-count(uniqueness, "alignments", "exhaustive")
+count(uniqueness, "_coarse_peaks", "exhaustive")
 count(local_maps, "local_map", "local maps")
 count(JointGraph, "optimize", "quick solves")
 count(decisions, "reevaluate", "re-evaluations")
