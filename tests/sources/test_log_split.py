@@ -1,3 +1,4 @@
+from copy import copy
 from itertools import zip_longest
 
 import numpy as np
@@ -68,6 +69,8 @@ def test_parts_can_be_read_side_by_side(tmp_path):
         alone = list(part.records())
         for one, other in zip([pair[number] for pair in together if pair[number]], alone, strict=True):
             assert one.stamp == other.stamp
+    next(copy(parts[0]).records())
+    assert parts[0].faults[Fault.BROKEN_LINE].count == 2, "a copy counts its own pass"
 
 
 def test_every_fault_is_counted_in_one_part(tmp_path):

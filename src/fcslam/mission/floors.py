@@ -2,37 +2,22 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from copy import copy
 from dataclasses import replace
 
 from fcslam.errors import InputError, PacketError
 from fcslam.records import CloudScan, LaserScan, SensorRecord
 from fcslam.sources import Source
-from fcslam.sources.faults import Faults
-from fcslam.sources.source import Survey
+from fcslam.sources.source import Derived
 from fcslam.wire.checks import check_floor
 
 
-class OnFloors:
+class OnFloors(Derived):
     """A recording whose scans name their floors."""
 
     def __init__(self, source: Source, floors: Mapping[float, str]) -> None:
         """``floors``: by the time at which the robot came there, in seconds since the first scan."""
-        self.name = source.name
-        self._source = copy(source)
+        super().__init__(source)
         self._floors = floors
-
-    def __copy__(self) -> "OnFloors":
-        return OnFloors(self._source, self._floors)
-
-    @property
-    def faults(self) -> Faults:
-        """See ``Source``."""
-        return self._source.faults
-
-    def survey(self) -> Survey:
-        """See ``Source``."""
-        return self._source.survey()
 
     def records(self) -> Iterator[SensorRecord]:
         """See ``Source``; the first scan on each floor names it."""

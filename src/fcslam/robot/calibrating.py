@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from copy import copy
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeGuard
@@ -22,12 +21,11 @@ from fcslam.robot.predicted_motion import PREDICTED, MotionPrediction
 from fcslam.robot.wheel_odometry import is_jump
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.contradictions import RepeatedScans
-from fcslam.sources.faults import Faults
 from fcslam.sources.formats import bag_of
 from fcslam.sources.motion import OdometryUpdates
 from fcslam.sources.pose import pose_of
 from fcslam.sources.returns import FloorLine
-from fcslam.sources.source import Source, Survey
+from fcslam.sources.source import Derived, Source, Survey
 
 if TYPE_CHECKING:
     from fcslam.sources.bags.rosbag import RosBag
@@ -231,30 +229,17 @@ def _scale_line(name: str, scale: Estimate, remedy: str) -> str:
     return f"the robot's {name} is {scale.value:.3f} of what odometry says (+- {scale.sigma:.3f}); {state}: {remedy}"
 
 
-class Noted:
+class Noted(Derived):
     """A recording with further notes in its survey."""
 
     def __init__(self, source: Source, notes: tuple[str, ...]) -> None:
-        self.name = source.name
-        self._source = copy(source)
+        super().__init__(source)
         self._notes = notes
-
-    def __copy__(self) -> "Noted":
-        return Noted(self._source, self._notes)
-
-    @property
-    def faults(self) -> Faults:
-        """As in Source."""
-        return self._source.faults
 
     def survey(self) -> Survey:
         """As in Source."""
         survey = self._source.survey()
         return replace(survey, notes=(*survey.notes, *self._notes))
-
-    def records(self) -> Iterator[SensorRecord]:
-        """As in Source."""
-        return self._source.records()
 
 
 def calibrated(source: Source, config: LidarConfig) -> Source:

@@ -5,7 +5,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from math import isnan
-from typing import Protocol
+from typing import Protocol, Self
 
 from fcslam.errors import SourceError
 from fcslam.records import CameraModel, CloudScan, GnssFix, LaserModel, LaserScan, SensorRecord, frozen
@@ -60,6 +60,31 @@ class Source(Protocol):
         """
 
 
+class Derived:
+    """A recording that changes what another one says."""
+
+    def __init__(self, source: Source) -> None:
+        self.name, self._source = source.name, copy(source)
+
+    def __copy__(self) -> Self:
+        twin = object.__new__(type(self))
+        twin.__dict__ |= self.__dict__ | {"_source": copy(self._source)}
+        return twin
+
+    @property
+    def faults(self) -> Faults:
+        """As in Source."""
+        return self._source.faults
+
+    def survey(self) -> Survey:
+        """As in Source."""
+        return self._source.survey()
+
+    def records(self) -> Iterator[SensorRecord]:
+        """As in Source."""
+        return self._source.records()
+
+
 def split(source: Source, parts: int) -> list[Source]:
     """Split a recording into robots ``<name>_1``, ``<name>_2`` ... of equal scan count (to within one), in file order.
 
@@ -78,21 +103,19 @@ def split(source: Source, parts: int) -> list[Source]:
     ]
 
 
-class Part:
+class Part(Derived):
     """``count`` scans of a recording, from its scan ``first`` on, as a robot of its own."""
 
     def __init__(self, whole: Source, first: int, count: int, name: str) -> None:
-        self._whole = copy(whole)
-        """A copy with its own pass, because parts are read concurrently."""
-        self._first, self._count = first, count
+        super().__init__(whole)
+        self.name, self._first, self._count = name, first, count
         self._before = Faults({})
         """Those of the scans before."""
-        self.name = name
 
     @property
     def faults(self) -> Faults:
         """As in Source, of this part only."""
-        return self._whole.faults.since(self._before)
+        return self._source.faults.since(self._before)
 
     def survey(self) -> Survey:
         """As in Source."""
@@ -101,7 +124,7 @@ class Part:
             pose = pose_of(scan.T_odom_base)
             track.add(scan.stamp, UNKNOWN_POSE if isnan(pose[0]) else pose)
         return replace(
-            self._whole.survey(),
+            self._source.survey(),
             scan_count=track.count,
             duration_s=track.duration_s,
             path_length_m=track.length_m,
@@ -112,12 +135,12 @@ class Part:
         """As in Source; the first record is a scan at the identity, and others belong to the scan before them."""
         origin, seen = UNKNOWN_POSE, 0
         self._before = Faults({})
-        for record in self._whole.records():
+        for record in self._source.records():
             if isinstance(record, LaserScan | CloudScan):
                 if seen == self._first + self._count:
                     return
                 if seen == self._first:
-                    self._before = self._whole.faults if seen else self._before
+                    self._before = self._source.faults if seen else self._before
                     origin = pose_of(record.T_odom_base)
                 seen += 1
             if seen <= self._first:
