@@ -163,13 +163,17 @@ def test_the_list_says_who_did_what_and_what_was_undone(run, capsys):
     assert edit(run, "veto", first, second) == 0
     assert f"fcslam map --onto {run}" in capsys.readouterr().err
     assert edit(run, "undo", 1) == 0
+    start = open_run(run).trajectories[first].stamps[0]
+    assert edit(run, "remove", first, "--from", start) == 0
     capsys.readouterr()
     assert main(["edit", "list", str(run)]) == 0
-    rows = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    shown = capsys.readouterr().out
+    rows = [line.split("│")[1:-1] for line in shown.splitlines() if line.startswith("│")]
     rows = [row for row in rows if row[0].strip()]  # a cell may have several lines
-    assert [row[0].strip() for row in rows] == ["1", "2"]
+    assert [row[0].strip() for row in rows] == ["1", "2", "3"]
     assert all("anna" in row[2] for row in rows)
     assert ["veto" in rows[0][3], rows[0][-1].strip()] == [True, "2"]
+    assert "last_s" not in shown, "the stretch has no end"
 
 
 BAD = {

@@ -31,6 +31,8 @@ _NEGATIVE = {"ignore_unknown_options": True}
 _EVER_S = 1e12
 """Begins and ends a stretch without a stamp: no file of edits holds infinities."""
 
+_OPEN = None, -_EVER_S, _EVER_S
+"""Values that a list of edits leaves out."""
 _BELOW_MM = r"(?<=\.\d{3})\d+"
 
 Mission = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder or mission file.")]
@@ -59,7 +61,7 @@ def list_edits(mission: Mission) -> None:
     gone = undone(edits)
     for edit in edits:
         when = f"{datetime.fromtimestamp(edit.time_s, UTC):%Y-%m-%d %H:%M:%S} UTC" if edit.time_s else "from the start"
-        values = ", ".join(f"{name} {value}" for name, value in asdict(edit.content).items() if value is not None)
+        values = ", ".join(f"{name} {value}" for name, value in asdict(edit.content).items() if value not in _OPEN)
         change = f"{kind_of(edit.content)}: {re.sub(_BELOW_MM, '', values)}"
         table.add_row(*map(Text, (str(edit.number), when, edit.author, change, str(gone.get(edit.number, "")))))
     answers().print(table if edits else "no edits")
