@@ -194,11 +194,6 @@ class Outputs:
             statuses.append(self._status(name, mate.robot, self._levels.OK, where, values))
         self._diagnose(FLEET_STATUS, now_ns, statuses)
 
-    def event(self, stamp_ns: int, robot: str, text: str) -> None:
-        """Publish one event of the fleet's map on the topic of diagnostics."""
-        status = self._status(f"fcslam: {robot}: fleet", robot, self._levels.OK, text, {"event": "fleet"})
-        self._diagnose(DIAGNOSTICS_TOPIC, stamp_ns, [status])
-
     def diagnostics(
         self, stamp_ns: int, robot: str, trouble: str, values: Mapping[str, object], well: str = "mapping"
     ) -> None:
