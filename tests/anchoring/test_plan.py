@@ -7,21 +7,24 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.anchoring.anchors import Anchors, anchoring_lines, read_anchors
+from fcslam.anchoring.anchors import Anchors, anchored, anchoring_lines, read_anchors
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
+from fcslam.cloud.report import fuse_members
+from fcslam.config import parse_yaml
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
-from tests.planned_building import OTHER_WALLS, WALLS, anchored_map, mapped, off_m, plan_of
+from tests.planned_building import OTHER_WALLS, WALLS, mapped, off_m, plan_of
 
 pytestmark = pytest.mark.slow
 
 
 def placed(result, plan=None, by_hand=()):
     anchors = Anchors(BuildingPlan(plan) if isinstance(plan, OccupancyMap) else plan)
-    return anchored_map(result, anchors, by_hand)
+    return anchored(result, anchors, by_hand, lambda members: fuse_members(members, OccupancyConfig()))
 
 
 def report_of(placing):
@@ -68,10 +71,20 @@ def test_lengths_get_the_scale_of_the_plan(scale):
     assert after.keyscans[0].ranges_m / before.keyscans[0].ranges_m == pytest.approx(1.0 / scale, abs=0.001)
 
 
-def test_a_plan_in_another_scale_changes_nothing_and_both_sizes_are_said():
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda plan: plan.mirrored(), "it fits mirrored"),
+        (lambda plan: plan.scaled(1.1), "the plan is 11.1 m by 17.7 m, and the map 9.9 m by 15.9 m; it fits at 0.909"),
+        (
+            lambda plan: replace(plan.scaled(25.4), unit_m=0.0254),
+            "and the map 9.9 m by 15.9 m; if it is drawn in millimetres and not in inches: --plan-scale 0.001",
+        ),
+    ],
+)
+def test_what_makes_a_plan_fit_is_said(change, words):
     result, _ = mapped()
-    larger = replace(plan_of(), resolution_m=1.1 * plan_of().resolution_m)
-    assert "; the plan is 11.2 m by 17.8 m, and the map 9.9 m by 15.9 m" in report_of(placed(result, larger))["reason"]
+    assert words in report_of(placed(result, change(BuildingPlan(plan_of()))))["reason"]
 
 
 def test_the_plan_of_another_building_changes_nothing():
@@ -96,26 +109,16 @@ def test_a_building_that_looks_the_same_from_behind_needs_a_placement_by_hand():
 
 def test_walls_that_moved_are_gone_or_are_new_are_listed():
     walls = WALLS.copy()
-    walls[9] += (0.25, 0.0, 0.25, 0.0)  # moved
+    walls[9] += (0.6, 0.0, 0.6, 0.0)  # moved
     extra = np.array([(13.0, 0.0, 13.0, 2.5)])  # in the plan only
     result, _ = mapped()
     plan = np.concatenate((np.delete(walls, 12, axis=0), extra))  # 12 is new
     found = {d["kind"]: d for d in report_of(placed(result, plan_of(plan)))["deviations"]}
     assert set(found) == {"moved", "missing", "new"}
-    assert found["moved"]["by_m"] == pytest.approx(0.25, abs=0.05)
-    for kind, x, y in (("moved", 5.25, 1.5), ("missing", 13.0, 1.25), ("new", 14.0, 3.8)):
+    assert found["moved"]["by_m"] == pytest.approx(0.6, abs=0.05)
+    for kind, x, y in (("moved", 5.6, 1.5), ("missing", 13.0, 1.25), ("new", 14.0, 3.8)):
         middle = 0.5 * (np.array(found[kind]["start"]) + found[kind]["end"])
         assert np.hypot(*(middle - (x, y))) < 0.5, kind
-
-
-def test_a_wall_far_from_its_place_is_missing_there_and_new_here():
-    walls = WALLS.copy()
-    walls[9] += (0.6, 0.0, 0.6, 0.0)
-    found = {
-        d["kind"]: 0.5 * (d["start"][0] + d["end"][0])
-        for d in report_of(placed(mapped()[0], plan_of(walls)))["deviations"]
-    }
-    assert found == {"missing": pytest.approx(5.6, abs=0.1), "new": pytest.approx(5.0, abs=0.1)}
 
 
 def test_walls_of_the_plan_that_stand_are_no_deviations():
@@ -143,6 +146,23 @@ def test_a_drawing_is_read_in_any_colours_without_its_text(tmp_path, colours):
     assert plan.origin_xy == (0.0, 0.0)
 
 
+@pytest.mark.parametrize("is_picture", [True, False])
+def test_a_fleet_manager_gets_the_coordinates_of_plan_and_map(tmp_path, is_picture):
+    """Open-RMF counts from the upper left corner of a picture, with y up; a drawing has its own coordinates."""
+    assert read_plan(picture(tmp_path), 0.02).is_picture
+    assert not read_plan(drawing(tmp_path, 4)).is_picture
+    plan, (result, _) = BuildingPlan(plan_of(), is_picture=is_picture), mapped()
+    found = parse_yaml(placed(result, plan).files["rmf.yaml"].decode())["reference_coordinates"]
+    assert list(found) == ["L1"]
+    robot, rmf = np.array(found["L1"]["robot"]), np.array(found["L1"]["rmf"])
+    x, y = plan.drawing.origin_xy
+    offset = (x, y + plan.drawing.resolution_m * len(plan.drawing.cells)) if is_picture else (0.0, 0.0)
+    np.testing.assert_allclose(robot - rmf, np.tile(offset, (4, 1)), atol=1e-9)
+    assert np.linalg.matrix_rank(rmf - rmf.mean(axis=0)) == 2
+    other = placed(result, plan_of(OTHER_WALLS))
+    assert "rmf.yaml" not in other.files
+
+
 def test_a_map_of_ros_is_a_plan_in_its_own_coordinates(tmp_path):
     true = plan_of()
     (tmp_path / "map.pgm").write_bytes(pgm_bytes(true))
@@ -164,8 +184,9 @@ def drawing(folder, unit):
     return folder / "plan.dxf"
 
 
-def test_a_drawing_in_a_wrong_unit_gets_one_line(tmp_path):
-    with pytest.raises(SourceError, match=r"is 16000.000 m by 10000.000 m by its unit.*--plan-scale 0.001"):
+def test_a_drawing_that_names_a_wrong_unit_gets_the_scales_that_are_possible(tmp_path):
+    assert read_plan(drawing(tmp_path, 4)).unit_m == 0.001
+    with pytest.raises(SourceError, match=r"16.0 m by 10.0 m if it is drawn in millimetres: --plan-scale 0.001;"):
         read_plan(drawing(tmp_path, 4), 1.0)
 
 

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from fcslam.anchoring.plan import BuildingPlan
+from fcslam.anchoring.plan import UNITS_M, BuildingPlan, sides_m, unit_of
 from fcslam.geometry import se2
 from fcslam.graph.evidence import LEAD
 from fcslam.lidar.field import EMPTY
@@ -109,6 +109,29 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
     surface_m = SPACING_M * min(of_plan.count, of_map.count)
     share = of_map.count / len(building.surface)
     return PlanAlignment(plan, best.T_a_b, of_plan.explained, of_plan.violation, surface_m, share, lead)
+
+
+def misfit(plan: BuildingPlan, building: Submap) -> str:
+    """The sizes of a plan and of a map that do not fit, and what makes them fit; a part of a sentence."""
+    shorter_m, longer_m = plan.sides_m
+    its_shorter_m, its_longer_m = sides_m(building.surface.points)
+    said = (
+        f"the plan is {shorter_m:.1f} m by {longer_m:.1f} m, and the map {its_shorter_m:.1f} m by {its_longer_m:.1f} m"
+    )
+    factor, unit_m = its_longer_m / longer_m, plan.unit_m or 0.0
+    if unit := unit_of(unit_m):
+        usual_m, name = min(UNITS_M, key=lambda each: abs(np.log(each[0] / (factor * unit_m))))
+        if name != unit and abs(np.log(usual_m / (factor * unit_m))) < 0.5:  # one may show more than the other
+            return f"{said}; if it is drawn in {name} and not in {unit}: --plan-scale {usual_m:g}"
+    for other in () if plan.submap.field.is_full else (plan.mirrored(), plan.scaled(factor)):
+        alignment = align_to_plan(other, building, placed=False)
+        if alignment is None or alignment.refusal:
+            continue
+        if other.drawing.resolution_m == plan.drawing.resolution_m:
+            return f"{said}; it fits mirrored"
+        factor /= lengths_in_plan(other.submap, building, alignment.T_plan_map)[0]
+        return f"{said}; it fits at {factor:.3f} of its size{f': --plan-scale {factor * unit_m:.4g}' * (unit_m > 0.0)}"
+    return said
 
 
 def lengths_in_plan(plan: Submap, building: Submap, T_plan_map: FloatArray) -> tuple[float, float]:

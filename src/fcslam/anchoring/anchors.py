@@ -1,19 +1,21 @@
 """Places the maps of a result by what is known about the building. Which robots share a map is decided before."""
 
 import json
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fcslam.cloud.result import FleetResult
+from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.errors import InputError
 from fcslam.lidar.field import TOO_MANY_WALLS
 from fcslam.lidar.submap import Submap
-from fcslam.maps.exports import outlines
-from fcslam.maps.occupancy_map import GEOREFERENCE, Occupancy, map_stem
+from fcslam.maps.changes import grown
+from fcslam.maps.drawing import highlighted_png
+from fcslam.maps.exports import outlines, rmf_yaml
+from fcslam.maps.occupancy_map import GEOREFERENCE, RMF_YAML, Occupancy, OccupancyMap, map_stem
 from fcslam.records import StrPath
 
 if TYPE_CHECKING:
@@ -23,7 +25,14 @@ if TYPE_CHECKING:
     from fcslam.anchoring.plan_fit import PlanFit
     from fcslam.anchoring.surveyed_tags import Survey
 
-PLAN_JSON, TAGS_JSON = "plan.json", "tags.json"
+PLAN_JSON, PLAN_PNG = "plan.json", "plan.png"
+TAGS_JSON = "tags.json"
+FIRST_LEVEL = "L1"
+"""Level of a map whose floor has no name."""
+ONLY_SCANS, ONLY_PLAN = "only in the scans", "only in the plan"
+
+FuseMembers = Callable[[Sequence[MappedRobot]], OccupancyMap]
+"""The occupancy map of robots that share one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,42 +68,56 @@ def read_anchors(plan: StrPath | None = None, plan_scale: float | None = None, t
     return Anchors(building, None if tags is None else read_survey(Path(tags)))
 
 
-def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int]) -> tuple[FleetResult, dict[str, bytes]]:
-    """Place each map by the floor plan, else by surveyed tags, else by fixes; those ``placed`` by a user stay there.
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchored:
+    """A result in the coordinates of the building or of the earth."""
 
-    Returns:
-        The result in the coordinates of the building or of the earth, and the files of the run folder about it.
+    result: FleetResult
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    """Files of the run folder about it, by name."""
+
+
+def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fuse: FuseMembers) -> Anchored:
+    """Place each map by the floor plan, else by surveyed tags, else by fixes.
+
+    Maps that a user ``placed`` stay about there. ``fuse`` draws a map.
     """
     from fcslam.anchoring.alignment import align_to_plan
     from fcslam.anchoring.gnss import georeferenced
     from fcslam.anchoring.part import part_of, with_part
     from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
-    from fcslam.anchoring.surveyed_tags import MapTags, Surveyed, placed_by_tags
+    from fcslam.anchoring.surveyed_tags import MapTags, placed_by_tags
 
     files: dict[str, bytes] = {}
-    reports: list[dict[str, Any]] = []
+    reports, pictures = [], []
     tags: list[dict[str, Any]] = []
     distances: dict[str, float] = {}
     surveyed: list[dict[str, Any]] = []
     for k in sorted({robot.map_index for robot in result.robots}):
-        part, alignment = part_of(result, k), None
+        part, is_placed = part_of(result, k), k in placed
+        alignment = None
         if anchors.plan is not None:
             building = map_submap(part.robots) if any(robot.keyscans for robot in part.robots) else None
             if building is not None and not building.field.is_full and not anchors.plan.submap.field.is_full:
-                alignment = align_to_plan(anchors.plan, building, k in placed)
+                alignment = align_to_plan(anchors.plan, building, is_placed)
             if alignment is not None and not alignment.refusal:
                 fit = fit_to_plan(alignment.plan, part, alignment.T_plan_map)
                 part = fit.part
                 reports.append(_plan_report(k, alignment, fit))
+                pictures.append(fuse(part.robots))
             else:
                 reports.append({"map": k, "aligned": False, "reason": _refusal(anchors.plan, building, alignment)})
         in_plan = alignment is not None and not alignment.refusal
-        fixed = "it keeps the frame of its plan" if in_plan else "it was placed by hand" if k in placed else ""
+        by_tags = False
         if anchors.survey is not None:
-            by_tags = Surveyed(part, (), {}, fixed) if fixed else placed_by_tags(part, result.sightings, anchors.survey)
-            part, fixed = by_tags.part, fixed or ("" if by_tags.refusal else "it lies in the survey")
-            surveyed.append({"map": k, **by_tags.report()})
-        found = georeferenced(part, is_fixed=bool(fixed))
+            if in_plan or is_placed:
+                reason = "it keeps the frame of its plan" if in_plan else "it was placed by hand"
+                surveyed.append({"map": k, "reason": reason, "used": [], "ignored": {}})
+            else:
+                found_tags = placed_by_tags(part, result.sightings, anchors.survey)
+                part, by_tags = found_tags.part, not found_tags.refusal
+                surveyed.append({"map": k, **found_tags.report()})
+        found = georeferenced(part, is_fixed=in_plan or is_placed or by_tags)
         if found is not None:
             part = found.part
             files[map_stem(k) + GEOREFERENCE] = _json(_geo_report(found))
@@ -105,22 +128,23 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int]) -> 
     if result.sightings or anchors.survey is not None:
         files[TAGS_JSON] = _json({"tags": tags, "distances": distances, "surveyed": surveyed})
     if anchors.plan is not None:
+        files |= _rmf(anchors.plan, [r.floor for r in result.robots if reports[r.map_index]["aligned"]])
         drawing = anchors.plan.drawing
         files[PLAN_JSON] = _json({"maps": reports, "drawing": outlines(drawing.cells == Occupancy.OCCUPIED, drawing)})
-    return result, files
+        files[PLAN_PNG] = _picture(drawing, pictures)
+    return Anchored(result, files)
 
 
 def _refusal(plan: "BuildingPlan", building: Submap | None, alignment: "PlanAlignment | None") -> str:
     """Why a map is not aligned with a plan."""
-    from fcslam.anchoring.plan import size_of
+    from fcslam.anchoring.alignment import misfit
 
     if building is None or not len(building.surface):
         return "the map has no walls"
     if building.field.is_full:
         return f"it {TOO_MANY_WALLS}"
     reason = f"the plan {TOO_MANY_WALLS}: check its unit, or crop it" if alignment is None else alignment.refusal
-    sizes = (size_of(submap.surface.points) for submap in (plan.submap, building))
-    return "{}; the plan is {}, and the map {}".format(reason, *sizes)
+    return f"{reason}; {misfit(plan, building)}"
 
 
 def _plan_report(k: int, alignment: "PlanAlignment", fit: "PlanFit") -> dict[str, object]:
@@ -149,6 +173,11 @@ def _plan_report(k: int, alignment: "PlanAlignment", fit: "PlanFit") -> dict[str
     }
 
 
+def _rmf(plan: "BuildingPlan", floors: Sequence[str]) -> dict[str, bytes]:
+    """The file for Open-RMF, if robots on these floors are in maps that lie in the plan."""
+    return {RMF_YAML: rmf_yaml(plan.drawing, plan.is_picture, floors[0] or FIRST_LEVEL).encode()} if floors else {}
+
+
 def _geo_report(found: "Georeference") -> dict[str, object]:
     counts: dict[str, float] = {"fixes": found.fixes, "ignored": found.ignored}
     counts |= {"sigma_m": round(found.sigma_m, 4), "stated_sigma_m": round(found.stated_sigma_m, 4)}
@@ -166,6 +195,31 @@ def _geo_report(found: "Georeference") -> dict[str, object]:
 
 def _json(content: object) -> bytes:
     return (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
+
+
+def _picture(plan: OccupancyMap, maps: Sequence[OccupancyMap]) -> bytes:
+    side = maps[0].resolution_m if maps else max(plan.resolution_m, 0.05)
+    lows = [np.array(one.origin_xy) for one in (plan, *maps)]
+    highs = [
+        low + one.resolution_m * np.array(one.cells.shape[::-1]) for low, one in zip(lows, (plan, *maps), strict=True)
+    ]
+    low = np.floor(np.min(lows, axis=0) / side) * side
+    size = np.ceil((np.max(highs, axis=0) - low) / side).astype(int) + 1
+    lines, walls, free = (np.zeros(size[::-1], bool) for _ in range(3))
+    for one, state, mask in (
+        (plan, Occupancy.OCCUPIED, lines),
+        *((m, Occupancy.OCCUPIED, walls) for m in maps),
+        *((m, Occupancy.FREE, free) for m in maps),
+    ):
+        rows, columns = np.nonzero(one.cells == state)
+        at = (np.column_stack((columns, rows)) + 0.5) * one.resolution_m + np.array(one.origin_xy) - low
+        column, row = np.floor(at / side).astype(np.int64).T
+        mask[row, column] = True
+    cells = np.where(free, Occupancy.FREE, Occupancy.UNKNOWN).astype(np.uint8)
+    cells[walls] = Occupancy.OCCUPIED
+    near = max(1, round(0.1 / side))
+    union = OccupancyMap(cells, side, (float(low[0]), float(low[1])))
+    return highlighted_png(union, walls & ~grown(lines, near), lines & ~grown(walls, near), (ONLY_SCANS, ONLY_PLAN))
 
 
 def anchoring_lines(files: Mapping[str, bytes]) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """How a building differs from its floor plan: walls that are missing, new, or somewhere else."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
@@ -25,8 +25,8 @@ AWAY_M: Final = 3.0 * OFF_M
 SHORTEST_M: Final = 1.5
 """Shortest wall that is missing or moved: shorter lines of a plan are furniture and doors."""
 SHORTEST_NEW_M: Final = 2.0
-"""Shortest new wall, as shorter surfaces are furniture."""
-_STEPS: Final = round(AWAY_M / SPACING_M)
+"""Shortest new wall, as shorter surfaces are furniture; a missing wall that stands parallel within it has moved."""
+_STEPS: Final = round(2.0 * AWAY_M / SPACING_M)
 """Steps of ``SPACING_M`` to either side in which a wall is looked for."""
 JOINED_M: Final = 0.35
 """Points of one wall are at most this far apart."""
@@ -42,7 +42,7 @@ class DeviationKind(StrEnum):
     NEW = "new"
     """It is not in the plan."""
     MOVED = "moved"
-    """It stands parallel to its place in the plan, ``AWAY_M`` from it at most; farther away it is another wall."""
+    """It stands parallel to its place in the plan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +74,32 @@ class Comparison:
     """Mean distance of the confirmed surface from the plan; NaN without any."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Wall:
+    points: FloatArray
+    normals: FloatArray
+    off_m: float | None
+    """Median distance of the other map's wall; None if no wall is close by."""
+
+    @property
+    def normal(self) -> FloatArray:
+        """Direction across the wall, shape (2,)."""
+        _, vectors = np.linalg.eigh(self.normals.T @ self.normals)
+        return np.asarray(vectors[:, 1])
+
+    def along(self, normal: FloatArray) -> tuple[float, float]:
+        """First and last coordinate along walls with this normal."""
+        at = self.points @ (-normal[1], normal[0])
+        return float(at.min()), float(at.max())
+
+    def deviation(self, kind: DeviationKind, by_m: float | None = None) -> Deviation:
+        """The wall as a deviation of this kind."""
+        normal = self.normal
+        across = float(np.median(self.points @ normal)) * normal
+        (x0, y0), (x1, y1) = (across + at * np.array((-normal[1], normal[0])) for at in self.along(normal))
+        return Deviation(kind, (float(x0), float(y0)), (float(x1), float(y1)), by_m)
+
+
 def compare_with_plan(plan: Submap, building: Submap) -> Comparison:
     """Find the walls of a building, a map in the coordinates of the plan, that differ from the plan."""
     points, normals = plan.surface.points, plan.surface.normals
@@ -81,10 +107,16 @@ def compare_with_plan(plan: Submap, building: Submap) -> Comparison:
     confirmed, unseen = np.abs(across) <= OFF_M, np.isnan(across)
     passed = unseen & _in_free(points, building) & (_distance(points, building) > AWAY_M)
     unknown = _distance(building.surface.points, plan) > AWAY_M
-    found = [
-        *_walls(points, normals, passed | (~unseen & ~confirmed), across),
-        *_walls(building.surface.points, building.surface.normals, unknown),
-    ]
+    new = list(_walls(building.surface.points, building.surface.normals, np.zeros(len(unknown)), unknown))
+    taken: set[int] = set()
+    found: list[Deviation] = []
+    for wall in _walls(points, normals, across, passed | (~unseen & ~confirmed)):
+        match = _moved(wall, new, SHORTEST_NEW_M)
+        if match is not None:
+            taken.add(match[0])
+        by_m = wall.off_m if wall.off_m is not None else match[1] if match is not None else None
+        found.append(wall.deviation(DeviationKind.MISSING if by_m is None else DeviationKind.MOVED, by_m))
+    found += [wall.deviation(DeviationKind.NEW) for k, wall in enumerate(new) if k not in taken]
     least_m = {DeviationKind.NEW: SHORTEST_NEW_M}
     kept = [deviation for deviation in found if deviation.length_m >= least_m.get(deviation.kind, SHORTEST_M)]
     kept.sort(key=lambda deviation: (-deviation.length_m, deviation.start))
@@ -123,10 +155,8 @@ def _in_free(points: FloatArray, building: Submap) -> NDArray[np.bool_]:
     return result
 
 
-def _walls(
-    points: FloatArray, normals: FloatArray, chosen: NDArray[np.bool_], across: FloatArray | None = None
-) -> Iterator[Deviation]:
-    """The straight walls among the chosen points, both sides of a wall as one; new ones if there is no ``across``."""
+def _walls(points: FloatArray, normals: FloatArray, across: FloatArray, chosen: NDArray[np.bool_]) -> Iterator[_Wall]:
+    """The straight walls among the chosen points: both sides of a wall are one."""
     rows = np.flatnonzero(chosen & np.any(normals != 0.0, axis=1))
     if not len(rows):
         return
@@ -140,16 +170,35 @@ def _walls(
     _, label = connected_components(links, directed=False)
     order = np.argsort(label, kind="stable")
     for members in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
-        kind, by_m = DeviationKind.NEW, None
-        if across is not None:
-            off = np.abs(across[rows[members]])
-            off = off[off > OFF_M]  # false for NaN
-            is_known = len(off) >= LEAST_SHARE * len(members)  # enough of it has a wall close by
-            kind = DeviationKind.MOVED if is_known else DeviationKind.MISSING
-            by_m = float(np.median(off)) if is_known else None
-        _, vectors = np.linalg.eigh(its[members].T @ its[members])
-        normal = vectors[:, 1]
-        along = np.array((-normal[1], normal[0]))
-        middle, at = np.median(xy[members] @ normal) * normal, xy[members] @ along
-        (x0, y0), (x1, y1) = (middle + end * along for end in (at.min(), at.max()))
-        yield Deviation(kind, (float(x0), float(y0)), (float(x1), float(y1)), by_m)
+        off = np.abs(across[rows[members]])
+        off = off[off > OFF_M]  # false for NaN
+        is_known = len(off) >= LEAST_SHARE * len(members)  # enough of it has a wall close by
+        its_off_m = float(np.median(off)) if is_known else None
+        yield _Wall(xy[members], its[members], its_off_m)
+
+
+def _moved(wall: _Wall, others: Sequence[_Wall], farthest_m: float) -> tuple[int, float] | None:
+    normal = wall.normal
+    first, last = wall.along(normal)
+    best: tuple[int, float] | None = None
+    for number, other in enumerate(others):
+        low, high = other.along(normal)
+        overlap = min(last, high) - max(first, low)
+        if abs(float(other.normal @ normal)) < PARALLEL or overlap < 0.5 * min(last - first, SHORTEST_M):
+            continue
+        by_m = _apart(wall, other, normal)
+        if by_m <= farthest_m and (best is None or by_m < best[1]):
+            best = number, by_m
+    return best
+
+
+def _apart(wall: _Wall, other: _Wall, normal: FloatArray) -> float:
+    """Distance of two parallel walls, side by side of the same facing if both have one."""
+    sides = []
+    for sign in (-1.0, 1.0):
+        faces = [its.points[sign * (its.normals @ normal) > 0.0] @ normal for its in (wall, other)]
+        if all(len(face) for face in faces):
+            sides.append(float(np.median(faces[1]) - np.median(faces[0])))
+    if not sides:
+        sides = [float(np.median(other.points @ normal) - np.median(wall.points @ normal))]
+    return abs(float(np.mean(sides)))

@@ -11,8 +11,10 @@ from fcslam.lidar.field import SurfelField
 from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import FREE_CELL_M, Submap
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
-from fcslam.records import FloatArray
+from fcslam.records import FloatArray, frozen
 
+UNITS_M: Final = ((0.001, "millimetres"), (0.01, "centimetres"), (0.0254, "inches"), (0.3048, "feet"), (1.0, "metres"))
+"""Units of drawings, in metres."""
 NORMAL_SIGMA_PX: Final = 2.0
 """Blur of the drawing whose gradient gives the normals."""
 _HERE: Final = np.zeros(3)
@@ -24,6 +26,10 @@ class BuildingPlan:
 
     drawing: OccupancyMap
     """Its lines are occupied, the other cells are free."""
+    unit_m: float | None = None
+    """Metres per pixel of a picture, or per unit of a DXF drawing; None: the plan has its own scale."""
+    is_picture: bool = True
+    """Whether the plan has pixels."""
     thickness_m: float = 0.0
     """By how much the sides of walls lie farther from their middle than they are drawn."""
 
@@ -33,6 +39,24 @@ class BuildingPlan:
         inside = cv2.distanceTransform((self.drawing.cells == Occupancy.OCCUPIED).astype(np.uint8), cv2.DIST_L2, 5)
         ridge = inside[(inside > 0.0) & (inside >= cv2.dilate(inside, np.ones((3, 3), np.uint8)))]
         return (float(np.median(ridge)) - 0.5) * self.drawing.resolution_m if len(ridge) else 0.0
+
+    @property
+    def sides_m(self) -> tuple[float, float]:
+        """The shorter and the longer side of the plan."""
+        shorter, longer = sides_m(np.argwhere(self.drawing.cells == Occupancy.OCCUPIED).astype(np.float64))
+        return shorter * self.drawing.resolution_m, longer * self.drawing.resolution_m
+
+    def mirrored(self) -> "BuildingPlan":
+        """The plan seen from below."""
+        return replace(self, drawing=replace(self.drawing, cells=frozen(self.drawing.cells[:, ::-1], np.uint8)))
+
+    def scaled(self, factor: float) -> "BuildingPlan":
+        """The plan in another size."""
+        x, y = self.drawing.origin_xy
+        drawing = replace(
+            self.drawing, resolution_m=factor * self.drawing.resolution_m, origin_xy=(factor * x, factor * y)
+        )
+        return replace(self, drawing=drawing)
 
     @cached_property
     def submap(self) -> Submap:
@@ -47,10 +71,15 @@ class BuildingPlan:
         return Submap.of(field, np.zeros((rows, columns), bool), corner)
 
 
-def size_of(points: FloatArray) -> str:
-    """The sides of the smallest rectangle around points, shape (N, 2), in words."""
+def unit_of(unit_m: float) -> str:
+    """The name of the unit of a drawing; empty if it has none, as a picture."""
+    return next((name for usual_m, name in UNITS_M if abs(unit_m - usual_m) < 1e-6), "")
+
+
+def sides_m(points: FloatArray) -> tuple[float, float]:
+    """The shorter and the longer side of the smallest rectangle around points, shape (N, 2)."""
     _, sides, _ = cv2.minAreaRect(points.astype(np.float32))
-    return f"{min(sides):.1f} m by {max(sides):.1f} m"
+    return min(sides), max(sides)
 
 
 def _edges(drawing: OccupancyMap) -> PointScan:

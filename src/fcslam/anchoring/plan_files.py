@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.anchoring.plan import BuildingPlan
+from fcslam.anchoring.plan import UNITS_M, BuildingPlan
 from fcslam.errors import SourceError
 from fcslam.lidar.field import WIDEST_M
 from fcslam.maps.drawing import SUBPIXEL_BITS
@@ -31,6 +31,8 @@ FAINTEST: Final = 2 * COLOUR_STEP
 """Least difference of the darkest lines from the background, in grey levels of 255."""
 FAINT_SHARE: Final = 0.4
 """Lines differ from the background by at least this share of the difference of the darkest ones: fills are fainter."""
+_LEAST_BUILDING_M: Final = 5.0
+"""A drawing of a smaller building has another unit."""
 _FLATNESS_M: Final = 0.25 * DXF_CELL_M
 """Largest distance of an arc from the line segments that replace it."""
 _NOT_WALLS: Final = ("TEXT", "MTEXT", "ATTRIB", "ATTDEF", "DIMENSION", "LEADER", "MULTILEADER", "IMAGE", "WIPEOUT")
@@ -48,11 +50,11 @@ def read_plan(path: Path, scale: float | None = None) -> BuildingPlan:
     try:
         match path.suffix.lower():
             case ".yaml" | ".yml":
-                plan = _ros_plan(path, scale)
+                plan, unit_m = _ros_plan(path, scale), None
             case ".dxf":
-                plan = _dxf_plan(path, scale)
+                plan, unit_m = _dxf_plan(path, scale)
             case _:
-                plan = _drawn_plan(path, scale)
+                plan, unit_m = _drawn_plan(path, scale), scale
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror or error}); give the file of a plan") from error
     height, width = plan.cells.shape
@@ -64,7 +66,9 @@ def read_plan(path: Path, scale: float | None = None) -> BuildingPlan:
     cells = _solid(_without_text(plan.cells, plan.resolution_m), plan.resolution_m)
     if not (cells == Occupancy.OCCUPIED).any():
         raise SourceError(f"{path}: the plan shows no lines longer than {TEXT_M:g} m; check the scale and the colours")
-    return BuildingPlan(OccupancyMap(frozen(cells, np.uint8), plan.resolution_m, plan.origin_xy))
+    return BuildingPlan(
+        OccupancyMap(frozen(cells, np.uint8), plan.resolution_m, plan.origin_xy), unit_m, path.suffix.lower() != ".dxf"
+    )
 
 
 def _ros_plan(path: Path, scale: float | None) -> OccupancyMap:
@@ -130,7 +134,7 @@ def _solid(cells: NDArray[np.uint8], cell_m: float) -> NDArray[np.uint8]:
     return np.asarray(closed[margin:-margin, margin:-margin], np.uint8)
 
 
-def _dxf_plan(path: Path, scale: float | None) -> OccupancyMap:
+def _dxf_plan(path: Path, scale: float | None) -> tuple[OccupancyMap, float]:
     try:
         import ezdxf
         from ezdxf import units
@@ -156,9 +160,15 @@ def _dxf_plan(path: Path, scale: float | None) -> OccupancyMap:
     size_m = points.max(axis=0) + 1.0 - low
     width, height = np.ptp(points, axis=0).tolist()
     if max(width, height) <= TEXT_M or size_m.max() > WIDEST_M:
+        others = [
+            f"{width / unit_m * other_m:.1f} m by {height / unit_m * other_m:.1f} m if it is drawn in {name}: "
+            f"--plan-scale {other_m:g}"
+            for other_m, name in UNITS_M
+            if _LEAST_BUILDING_M < max(width, height) / unit_m * other_m < WIDEST_M
+        ]
         raise SourceError(
-            f"{path}: the drawing is {width:.3f} m by {height:.3f} m by its unit, {WIDEST_M:.0f} m at most are "
-            "possible; give the metres per unit, as in --plan-scale 0.001, or delete what lies far outside"
+            f"{path}: the drawing is {width:.3f} m by {height:.3f} m by its unit, {WIDEST_M:.0f} m at most are possible"
+            f"; {'; '.join([*others, 'or delete what lies far outside'])}"
         )
     cell_m = DXF_CELL_M * max(1.0, math.ceil(math.sqrt(size_m.prod() / MOST_PIXELS) / DXF_CELL_M))
     width, height = np.ceil(size_m / cell_m).astype(int).tolist()
@@ -166,7 +176,7 @@ def _dxf_plan(path: Path, scale: float | None) -> OccupancyMap:
     for line in lines:
         corners = np.round(((line - low) / cell_m - 0.5) * (1 << SUBPIXEL_BITS)).astype(np.int32)
         cv2.polylines(cells, [corners], False, int(Occupancy.OCCUPIED), 1, cv2.LINE_8, SUBPIXEL_BITS)
-    return OccupancyMap(cells, cell_m, (float(low[0]), float(low[1])))
+    return OccupancyMap(cells, cell_m, (float(low[0]), float(low[1]))), unit_m
 
 
 def _dxf_lines(drawing: Any, flatness: float) -> list[FloatArray]:

@@ -1,6 +1,7 @@
 """An occupancy map for programs outside of robotics: a drawing (SVG), and a raster on the earth (GeoTIFF)."""
 
 import io
+import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -154,3 +155,18 @@ def geotiff(occupancy: OccupancyMap, frame: EarthFrame) -> bytes:
     written = io.BytesIO()
     Image.fromarray(pixels_of(occupancy.cells[::-1])).save(written, "TIFF", compression="tiff_deflate", tiffinfo=tags)
     return written.getvalue()
+
+
+def rmf_yaml(plan: OccupancyMap, is_picture: bool, level: str) -> str:
+    """Where a map that lies in a floor plan is in Open-RMF: ``reference_coordinates`` for the fleet adapters.
+
+    Open-RMF counts the metres of a plan ``is_picture`` from its upper left corner, with y up, so y is negative.
+    """
+    height_m, width_m = (plan.resolution_m * cells for cells in plan.cells.shape)
+    x, y = plan.origin_xy
+    corners = np.array([[x, y], [x + width_m, y], [x + width_m, y + height_m], [x, y + height_m]])
+    top_left = corners[3] if is_picture else np.zeros(2)
+    lines = (
+        f"    {name}: {points.round(4).tolist()}" for name, points in (("rmf", corners - top_left), ("robot", corners))
+    )
+    return "\n".join(("reference_coordinates:", f"  {json.dumps(level)}:", *lines, ""))

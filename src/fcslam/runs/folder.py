@@ -29,7 +29,7 @@ from functools import cached_property
 from pathlib import Path
 
 from fcslam.errors import InputError
-from fcslam.maps.occupancy_map import OccupancyMap, parse_map
+from fcslam.maps.occupancy_map import RMF_YAML, OccupancyMap, parse_map
 from fcslam.records import StrPath
 from fcslam.runs.records import LocalizedPoses, LocalMap, RobotTrajectory, RunTables
 from fcslam.runs.tables import (
@@ -178,7 +178,7 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
         raise InputError(f"{path}: not a run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one")
     try:
         robots = read_robots(path / ROBOTS, path)
-        pictures = [*path.glob("map*.*"), *path.glob("plan.*")]
+        pictures = [*path.glob("map*.*"), *path.glob("plan.*"), *path.glob(RMF_YAML)]
         own_maps = robots if maps and (path / LOCAL).exists() else ()
         return Run(
             trajectories={robot: _read_trajectory(path, robot, *where) for robot, where in robots.items()},
