@@ -241,16 +241,12 @@ class RobotNode:
         self._outputs.pose(stamp_ns, pose.pose, pose.covariance_6d)
 
     def _publish_transforms(self) -> None:
-        period_s = self._parameters.transform_publish_period
+        period_s, planner = self._parameters.transform_publish_period, self.sensors.planner
         due_s = time.monotonic()
         while not self._stop.wait(max(0.0, due_s - time.monotonic())):
             transform = self._transforms.due(self._clock.now_ns())
             if transform is not None:
-                child = (
-                    self.sensors.planner.base_frame
-                    if self.sensors.planner.is_without_odometry
-                    else self.sensors.planner.odom_frame
-                )
+                child = planner.base_frame if planner.is_without_odometry else planner.odom_frame
                 self._outputs.transform(transform[0], child, transform[1])
             due_s = max(due_s + period_s, time.monotonic() - period_s)
 
