@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,17 +67,10 @@ def read_anchors(plan: StrPath | None = None, plan_scale: float | None = None, t
     return Anchors(building, None if tags is None else read_survey(Path(tags)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Anchored:
-    """A result in the coordinates of the building or of the earth."""
-
-    result: FleetResult
-    files: Mapping[str, bytes] = field(default_factory=dict)
-    """Files of the run folder about it, by name."""
-
-
-def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fuse: FuseMembers) -> Anchored:
-    """Place each map by the floor plan, else by surveyed tags, else by fixes.
+def anchored(
+    result: FleetResult, anchors: Anchors, placed: Collection[int], fuse: FuseMembers
+) -> tuple[FleetResult, dict[str, bytes]]:
+    """Place each map by the floor plan, else by surveyed tags, else by fixes; and the run folder's files about it.
 
     Maps that a user ``placed`` stay about there. ``fuse`` draws a map.
     """
@@ -129,7 +122,7 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
         drawing = anchors.plan.drawing
         files[PLAN_JSON] = _json({"maps": reports, "drawing": outlines(drawing.cells == Occupancy.OCCUPIED, drawing)})
         files[PLAN_PNG] = _picture(drawing, pictures)
-    return Anchored(result, files)
+    return result, files
 
 
 def _refusal(plan: "BuildingPlan", building: Submap | None, alignment: "PlanAlignment | None") -> str:
