@@ -22,6 +22,7 @@ from tests.robot.kidnapping import put_down
 pytestmark = pytest.mark.slow
 
 RIGHT_M, RIGHT_RAD = 0.1, 0.03
+FRAGMENT_M, GAP_M = 4.0, 10.0
 
 
 def map_of(robots):
@@ -135,6 +136,25 @@ def test_a_robot_that_is_carried_away_is_found_again_and_never_wrong(fleet, buil
     assert run.metrics["losses"].value == 1
     assert wrong.sum() <= 5  # scans until the robot notices
     assert poses.is_localized[-1]
+
+
+def test_a_pose_at_which_most_walls_are_unknown_is_given_up_for_one_that_explains_them(fleet, building):
+    robot = fleet.robots[2]
+    start = robot.T_building_base[0]
+    # A fragment of the building, around the start of the robot, once more beside it.
+    rows, columns = np.indices(building.cells.shape)
+    x, y = (start[:2] - building.origin_xy) / building.resolution_m
+    fragment = building.cells.copy()
+    fragment[np.hypot(rows - y, columns - x) * building.resolution_m > FRAGMENT_M] = Occupancy.UNKNOWN
+    gap = np.full((len(fragment), round(GAP_M / building.resolution_m)), Occupancy.UNKNOWN, fragment.dtype)
+    twice = replace(building, cells=np.hstack((building.cells, gap, fragment)))
+    shift_m = (fragment.shape[1] + gap.shape[1]) * building.resolution_m
+    poses = localized(robot.scans(), twice, initial=start + np.array((shift_m, 0.0, 0.0))).localized["robot"]
+    off_m = np.hypot(*(poses.T_map_base - robot.T_building_base)[:, :2].T)
+    step_m = np.append(0.0, np.hypot(*np.diff(robot.T_building_base[:, :2], axis=0).T))
+    believed_wrongly = poses.is_localized & (off_m > 0.5 * shift_m)
+    assert 0.0 < step_m[believed_wrongly].sum() < 6.0
+    assert off_m[-1] < RIGHT_M
 
 
 class Keyscans:

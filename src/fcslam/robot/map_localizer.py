@@ -49,7 +49,8 @@ CHECK_EVERY_M = 2.0
 CHECKED_M = SUBMAP_REACH_M
 """Travel, in metres, whose walls are compared with the map."""
 DOUBTED = CLEAR
-"""With a smaller share of the walls in the map, the pose is compared with the best one elsewhere."""
+"""If a smaller share of all walls lies on walls of the map, the pose is compared with the best one elsewhere. Walls
+where the map knows nothing count, too: they may all lie in known area at the true pose."""
 LOST_IN_FREE_SPACE = 2.0 * MOST_IN_FREE_SPACE
 """A robot that is lost sees a larger share of its walls in free space of the map. It is less than that of keyscans
 (``LOST_VIOLATION``): a finished map has no error of the robot's newest poses."""
@@ -189,29 +190,30 @@ class MapLocalizer:
     def _check(self, keyscan: MappedKeyscan) -> None:
         assert self._T_map_base is not None
         self._checked_m = keyscan.travel_m
-        found = agreement(self._submap(CHECKED_M), self._map, self._T_map_base)
+        submap = self._submap(CHECKED_M)
+        found = agreement(submap, self._map, self._T_map_base)
         if found.overlap >= LEAST_OVERLAP:
             self._seen_m, self._quality = keyscan.travel_m, found.explained
             if found.explained < LOST_EXPLAINED and found.violation > LOST_IN_FREE_SPACE:
                 self._lose()
-            elif found.explained < DOUBTED:
-                self._contest(self._T_map_base, keyscan)
+            elif found.count < DOUBTED * len(submap.surface):
+                self._contest(self._T_map_base, keyscan, submap)
         elif keyscan.travel_m > self._seen_m + LARGEST_UNSEEN_M:
             self._lose()
 
-    def _contest(self, T_map_base: FloatArray, keyscan: MappedKeyscan) -> None:
-        """Give up a doubtful pose if the walls fit clearly better elsewhere."""
-        from fcslam.lidar.uniqueness import align_map, alignments
+    def _contest(self, T_map_base: FloatArray, keyscan: MappedKeyscan, submap: Submap) -> None:
+        """Give up a doubtful pose if the walls of the last metres fit clearly better elsewhere."""
+        from fcslam.lidar.uniqueness import align_map, best_alignment
 
-        submap = self._submap(CHECKED_M)
-        rival = next(iter(alignments(self._map, submap, T_map_base)), None)
-        if rival is None or rival.violation > MOST_IN_FREE_SPACE:
+        found = best_alignment(self._map, submap, LEAST_RIVAL_M)
+        if found is None:
             return
-        here = align_map(self._map, submap, T_map_base)
-        ratio = rival.score_m / max(LEAST_RIVAL_M, here.score_m)
-        if ratio >= LEAST_RATIO:
+        best, ratio = found
+        here_m = align_map(self._map, submap, T_map_base).score_m
+        if best.score_m >= LEAST_RATIO * max(LEAST_RIVAL_M, here_m) and best.violation <= MOST_IN_FREE_SPACE:
             self._lose()
-            self._vote(rival.T_a_b, ratio, submap, keyscan)
+            if ratio >= LEAST_RATIO:
+                self._vote(best.T_a_b, ratio, submap, keyscan)
 
     def _submap(self, reach_m: float) -> Submap:
         newest = self._recent[-1]
