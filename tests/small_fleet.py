@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
@@ -9,6 +10,8 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.result import FleetResult
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings, simulate_fleet
+from fcslam.records import SensorRecord
+from fcslam.robot.backend_runner import Submit
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
@@ -21,11 +24,21 @@ def draw(robots: int, path_length_m: float = 15.0, seed: int = 1) -> SimulatedFl
     return simulate_fleet(settings, seed)
 
 
+def driven(
+    records: Iterable[SensorRecord],
+    config: RobotConfig | None = None,
+    name: str = "r",
+    backend: Submit | None = None,
+) -> tuple[RobotFrontend, list[Packet]]:
+    """The front end of a robot after a recording, and everything that it sent."""
+    frontend = RobotFrontend(name, config or RobotConfig(), backend)
+    packets = [packet for record in records for packet in frontend.process(record)]
+    return frontend, packets + frontend.finish()
+
+
 def sent_by(robot: SimulatedRobot, name: str | None = None) -> list[Packet]:
     """Everything that a robot sends over its recording."""
-    frontend = RobotFrontend(name or robot.name, RobotConfig())
-    packets = [packet for scan in robot.scans() for packet in frontend.process(scan)]
-    return packets + frontend.finish()
+    return driven(robot.scans(), name=name or robot.name)[1]
 
 
 def in_order(packets: Iterable[Packet]) -> list[Packet]:
@@ -51,6 +64,11 @@ def fingerprint(result: FleetResult) -> tuple[object, ...]:
     corrections = tuple((c.robot, c.version, c.map_index, c.T_map_odom.tobytes()) for c in result.corrections)
     edges = tuple((e.i, e.j, e.T_i_j.tobytes(), e.information.tobytes(), e.robust) for e in result.graph.edges)
     return robots, closures, corrections, result.graph.poses().tobytes(), edges
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    """All files in a folder, to the last bit."""
+    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def map_of(result: FleetResult) -> dict[str, int]:

@@ -7,13 +7,9 @@ import os
 import re
 import shlex
 import signal
-import socket
 import sqlite3
 import subprocess
 import sys
-import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
@@ -23,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import httpx
 import pytest
 import yaml
 
@@ -32,8 +29,10 @@ from fcslam.geometry import se2
 from fcslam.sources import open_source
 from tests.carmen_logs import write_carmen
 from tests.lab.simulation.gl import require_gl
+from tests.postgres import free_port
 from tests.sources.test_bag_robots import fleet_bag
 from tests.test_docs import PAGES, ROOT, command_lines
+from tests.waiting import wait_for
 
 LISTED: dict[str, Any] = yaml.safe_load((ROOT / "tests" / "commands_of_docs.yaml").read_text(encoding="utf-8"))
 EXECUTED: dict[str, list[str]] = LISTED["executed"]
@@ -219,16 +218,16 @@ def end(process: subprocess.Popen[str]) -> str:
 
 def answer(url: str, process: subprocess.Popen[str]) -> bytes:
     """The content at a URL of the process, as soon as it is ready."""
-    until = time.monotonic() + PATIENCE_S
-    while True:
+
+    def read() -> bytes | None:
         try:
-            with urllib.request.urlopen(url, timeout=10) as response:
-                content: bytes = response.read()
-                return content
-        except (urllib.error.URLError, ConnectionError, TimeoutError):
-            if time.monotonic() > until or process.poll() is not None:
-                raise
-            time.sleep(0.3)
+            return httpx.get(url, timeout=10.0).raise_for_status().content
+        except httpx.TransportError:
+            assert process.poll() is None
+            return None
+
+    content: bytes = wait_for(read, PATIENCE_S)
+    return content
 
 
 def downloads(port: int) -> set[tuple[str, str]]:
@@ -243,8 +242,7 @@ def test_two_robots_and_a_service_as_the_pages_show_them(logs, desk, capsys):
     for name, long in (("anna", LONG), ("ben", MEETS)):  # after 45 scans, the evidence for a join is at its limit
         (link := desk / "examples" / "logs" / f"{name}.clf.xz").unlink()
         link.symlink_to(logs / long)
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
 
     def there(command: str) -> str:
         return as_here(command).replace("8340", str(port))
@@ -260,10 +258,8 @@ def test_two_robots_and_a_service_as_the_pages_show_them(logs, desk, capsys):
         assert robot.returncode == 0, said
         said += capsys.readouterr().out
         assert said.count("has confirmed all packets") == 2
-        until = time.monotonic() + PATIENCE_S
-        while json.loads(answer(f"http://127.0.0.1:{port}/api/v1/fleet", service))["maps"] > 1:
-            assert time.monotonic() < until, "the maps were not joined"
-            time.sleep(0.5)
+        fleet = f"http://127.0.0.1:{port}/api/v1/fleet"
+        wait_for(lambda: json.loads(answer(fleet, service))["maps"] == 1, PATIENCE_S)
         assert len(downloads(port)) == 3
         for file, url in downloads(port):
             (desk / file).write_bytes(answer(url, service))

@@ -28,6 +28,7 @@ from fcslam.page.report import ShownRun, report_html
 from fcslam.records import KeyscanId, VoxelMap
 from tests.cli.test_serve import API, Service, send
 from tests.mission.test_map_changes import write_run
+from tests.postgres import free_port
 
 pytestmark = pytest.mark.system
 
@@ -121,8 +122,7 @@ def mapped(packets, tmp_path_factory):
 
 
 def test_robots_join_before_the_eyes_of_a_viewer_although_the_service_is_killed(page, packets, tmp_path):
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        again = tmp_path / "data", "--port", str(free.getsockname()[1])
+    again = tmp_path / "data", "--port", str(free_port())
     service = Service(*again)
     page.goto(service.url)
     says(page, "#empty", "No robot has sent anything yet")

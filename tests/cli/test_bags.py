@@ -84,20 +84,6 @@ def test_a_file_with_an_equals_sign_is_a_file(tmp_path, monkeypatch):
     assert robots(tmp_path / "out") == {"speed_2": 40, "slow": 15}
 
 
-# Refusals
-
-
-def test_bad_bags_leave_nothing(tmp_path, refused):
-    (tmp_path / "empty.bag").write_bytes(b"#ROSBAG V2.0\n")
-    bad = {
-        save(tmp_path / "no_tf.mcap", drive(20)[1:]): "--sensors laser-pose",
-        tmp_path / "empty.bag": "there are no topics",
-    }
-    for path, reason in bad.items():
-        assert reason in refused("record", path, "-o", tmp_path / "out.mcap")
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in bad}
-
-
 # fcslam record, of a recording
 
 

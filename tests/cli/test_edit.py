@@ -9,7 +9,7 @@ import pytest
 from fcslam.cli import main
 from fcslam.geometry import se2
 from fcslam.mission.mission_file import edit_mission, read_mission
-from fcslam.records import ClosureStatus, ManualClosure, MapRegion, Pin, ReasonCode, RegionUse, Removal, Veto
+from fcslam.records import ClosureStatus, ManualClosure, MapRegion, Pin, RegionUse, Removal, Veto
 from fcslam.runs import open_run
 
 pytestmark = pytest.mark.slow
@@ -55,10 +55,6 @@ def ends_of(closure):
     return closure.robot_i, f"{closure.stamp_i:.9f}", closure.robot_j, f"{closure.stamp_j:.9f}"
 
 
-def is_at(closure, ends):
-    return ends_of(closure) in (ends, ends[2:] + ends[:2])
-
-
 def between(run):
     """Closures between robots."""
     return [closure for closure in open_run(run).closures if closure.robot_i != closure.robot_j]
@@ -72,10 +68,6 @@ def middle(run):
     """A point of the map that robots saw: where one of them stood."""
     poses = next(iter(open_run(run).trajectories.values())).T_map_base
     return poses[len(poses) // 2]
-
-
-def rectangle_at(x, y, half_m=0.5):
-    return f"{x - half_m:.3f},{y - half_m:.3f} {x + half_m:.3f},{y + half_m:.3f}"
 
 
 def commands(run):
@@ -133,19 +125,6 @@ def test_edits_of_every_kind_are_undone_to_the_same_bytes(mapped, run):
         edit(run, command, *arguments)
         assert edit(run, "undo", 2 * number + 1) == 0
     assert contents(again(run, "undone")) == contents(mapped)
-
-
-def test_edits_stay_in_force_when_the_mission_goes_on(run, logs):
-    ends = a_closure(run, ClosureStatus.ACCEPTED)
-    x, y, _ = middle(run)
-    assert edit(run, "veto", *ends) == 0
-    assert edit(run, "area", "hall", rectangle_at(x, y)) == 0
-    assert edit(run, "keep-out", rectangle_at(x, y)) == 0
-    whole = run.with_name("whole")
-    assert main(["map", str(logs[2]), "--onto", str(run), "-o", str(whole), "-q"]) == 0
-    assert [closure.reason.code for closure in between(whole) if is_at(closure, ends)] == [ReasonCode.VETOED]
-    assert {"map_areas.geojson", "map_keepout.pgm"} <= open_run(whole).map_files.keys()
-    assert [edit.author for edit in read_mission(whole).edits] == 3 * ["anna"]
 
 
 def test_a_map_aligns_to_its_walls(run, drawn):

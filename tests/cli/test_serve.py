@@ -34,6 +34,7 @@ from fcslam.wire.http_transport import HttpTransport
 from fcslam.wire.keys import Server
 from fcslam.wire.packets import decode, encode
 from tests.small_fleet import in_order
+from tests.waiting import wait_for
 
 API = "/api/v1"
 
@@ -193,12 +194,6 @@ def test_a_removed_robot_leaves_no_trace_and_its_undo_neither(tmp_path, packets)
         def robots():
             return {robot for one in client.get(f"{API}/maps").json() for robot in one["robots"]}
 
-        def until(condition):
-            end = time.monotonic() + 300.0
-            while not condition():
-                assert time.monotonic() < end
-                time.sleep(0.1)
-
         expected = {}
         for name, sent in (("without", honest), ("with", packets)):
             client.post(f"{API}/missions", json={"name": name}).raise_for_status()
@@ -208,17 +203,17 @@ def test_a_removed_robot_leaves_no_trace_and_its_undo_neither(tmp_path, packets)
         client.post(f"{API}/missions", json={"name": "edited"}).raise_for_status()
         cut = 2 * len(packets) // 3
         play(packets[:cut])
-        until(lambda: robots() == {"robot_1", "robot_2", "robot_3"})
+        wait_for(lambda: robots() == {"robot_1", "robot_2", "robot_3"})
         removed = client.post(f"{API}/edits", json={"kind": "removal", "content": {"robot": "robot_2"}}).json()
-        until(lambda: robots() == {"robot_1", "robot_3"})
+        wait_for(lambda: robots() == {"robot_1", "robot_3"})
         os.kill(children(service.process.pid)[0], signal.SIGKILL)
         play(packets[cut:])
         assert finalized() == expected["without"]
         assert robots() == {"robot_1", "robot_3"}
         assert client.post(f"{API}/edits/{removed['number']}/undo").status_code == 201
         assert finalized() == expected["with"]
-        until(lambda: robots() == {"robot_1", "robot_2", "robot_3"})
-        until(lambda: client.get("/readyz").json()["backlog"] == 0)
+        wait_for(lambda: robots() == {"robot_1", "robot_2", "robot_3"})
+        wait_for(lambda: client.get("/readyz").json()["backlog"] == 0)
         audited = [json.loads(line)["action"] for line in (tmp_path / "data" / "audit.jsonl").read_text().splitlines()]
         assert audited[-4:] == [
             f"POST {API}/edits", f"POST {API}/finalize", f"POST {API}/edits/1/undo", f"POST {API}/finalize"

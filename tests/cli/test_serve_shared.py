@@ -1,11 +1,11 @@
 """`fcslam serve --store` answers wrong options in one line, without a password."""
 
+import contextlib
 import os
 import signal
 import socket
 import subprocess
 import sys
-import time
 
 import httpx
 import pytest
@@ -13,6 +13,7 @@ import pytest
 from fcslam.cli import main
 from fcslam.service.shared.registry import Registry
 from tests.postgres import PASSWORD, free_port
+from tests.waiting import wait_for
 
 WRONG = "no-such-secret"
 
@@ -98,19 +99,15 @@ def test_an_instance_shows_no_password_survives_its_database_and_ends_in_order(p
         [*command, *options], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     ) as served:
         try:
-            end = time.monotonic() + 120.0
-            while True:
-                assert time.monotonic() < end
-                try:
-                    health = httpx.get(f"http://127.0.0.1:{port}/healthz", verify=False)
-                except httpx.TransportError:
-                    health = None
-                if health is not None and health.status_code == 200:
-                    break
-                time.sleep(0.2)
+            address = f"http://127.0.0.1:{port}"
+
+            def is_ready():
+                with contextlib.suppress(httpx.TransportError):
+                    return httpx.get(f"{address}/healthz", verify=False).status_code == 200
+
+            wait_for(is_ready)
             workers = subprocess.run(["ps", "-eo", "args"], check=True, capture_output=True, text=True).stdout
             assert PASSWORD not in workers
-            address = f"http://127.0.0.1:{port}"
             assert httpx.get(f"{address}/missions/mission/api/v1/fleet").json()["mission"] == "mission"
             assert httpx.get(f"{address}/missions/other/api/v1/fleet").status_code == 404
             assert httpx.post(f"{address}/api/v1/missions", json={"name": "other"}).json()["open"] == "other"

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.records import CameraImage, LaserScan, Odometry
+from fcslam.records import LaserScan, Odometry
 from fcslam.runs import open_run, read_tum
 from fcslam.sources import open_source
-from tests.lab.simulation.gl import require_gl
 
 pytestmark = pytest.mark.slow
 
@@ -69,22 +68,3 @@ def test_what_cannot_be_is_refused(arguments, message, tmp_path, capsys):
     said = capsys.readouterr().err
     assert message in said
     assert "Traceback" not in said
-
-
-def test_a_folder_that_holds_something_is_left_alone(tmp_path, capsys):
-    (tmp_path / "notes").write_text("mine")
-    assert main([*TINY, "--no-camera", "--output", str(tmp_path)]) == 2
-    assert "is not empty; choose another place" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["notes"]
-
-
-@pytest.mark.system
-def test_cameras_are_recorded(tmp_path):
-    require_gl()
-    output = tmp_path / "fleet"
-    arguments = [*TINY, "--robots", "1", "--lighting", "evening", "--output", str(output)]
-    assert main(arguments) == 0
-    records = list(open_source(output / "robot_1").records())
-    images = [record for record in records if isinstance(record, CameraImage)]
-    assert len(images) > 20
-    assert images[0].camera.width == 320

@@ -9,10 +9,9 @@ from fcslam.geometry import se2, se3
 from fcslam.geometry.voxels import to_steps, voxelised
 from fcslam.lidar.scan import keyscan_points
 from fcslam.records import Constraint, FloatArray, Keyscan, LaserModel, Place, VoxelMap, frozen
-from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Hello, Packet
 from tests.flats import BACK, ROUND, Drive, flat
-from tests.small_fleet import in_order
+from tests.small_fleet import driven, in_order
 
 SCANNER_M = 0.6
 HEIGHTS_M = np.arange(0.05, 2.05, 0.1)
@@ -23,9 +22,8 @@ BASE_M = 0.25
 @lru_cache
 def planar(name: str, seed: int) -> tuple[Packet, ...]:
     """What a robot with a 2D LiDAR sends of its drive through the flat."""
-    frontend = RobotFrontend(name, RobotConfig())
-    scans = Drive(name, ROUND if name == "a" else BACK, flat(), seed).records()
-    return tuple([packet for scan in scans for packet in frontend.process(scan)] + frontend.finish())
+    drive = Drive(name, ROUND if name == "a" else BACK, flat(), seed)
+    return tuple(driven(drive.records(), name=name)[1])
 
 
 def leaning(pitch_rad: float) -> FloatArray:

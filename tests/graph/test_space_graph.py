@@ -84,20 +84,6 @@ def test_the_optimum_is_that_of_gtsam(loss):
     assert found == pytest.approx(cost, rel=1e-8)
 
 
-def test_jacobians_are_the_differences_of_residuals():
-    rng = np.random.default_rng(1)
-    T_i_j, x_i, x_j = (se3.exp(rng.normal(0.0, 0.7, (50, 6))) for _ in range(3))
-    residual, step = SE3.residual(T_i_j, x_i, x_j), 1e-6
-    for jacobian, moved in zip(SE3.jacobians(residual, x_i, x_j), (0, 1), strict=True):
-        for axis in range(6):
-            d = step * np.eye(6)[[axis] * 50]
-            ends = [
-                SE3.residual(T_i_j, *(SE3.retract(x, sign * d) if k == moved else x for k, x in enumerate((x_i, x_j))))
-                for sign in (1.0, -1.0)
-            ]
-            np.testing.assert_allclose(jacobian[:, :, axis], (ends[0] - ends[1]) / (2.0 * step), atol=1e-6)
-
-
 def test_exact_measurements_give_the_truth_without_a_start():
     graph, truth = spiral(2, 70)
     edges = graph.given()

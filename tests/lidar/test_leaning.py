@@ -13,12 +13,12 @@ from fcslam.lidar.leaning import floor_line, wrong_laser
 from fcslam.metrics.trajectory import PositionErrors, align, position_errors
 from fcslam.records import LaserModel, LaserScan, frozen
 from fcslam.robot.calibrating import calibrated
-from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source, write_bag
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.returns import FloorLine
 from tests.carmen_logs import write_carmen
 from tests.lidar import worlds
+from tests.small_fleet import driven
 
 pytestmark = pytest.mark.slow
 
@@ -104,11 +104,7 @@ def test_what_is_at_the_line_or_beyond_is_left_out_and_nothing_else():
 
 def path_of(source):
     """Poses of all scans in the local map of a robot."""
-    robot = RobotFrontend("r", RobotConfig())
-    for record in source.records():
-        robot.process(record)
-    robot.finish()
-    (track,) = robot.tracks
+    (track,) = driven(source.records())[0].tracks
     return track.T_odom_base()
 
 

@@ -1,6 +1,5 @@
 """What a robot knows of its fleet: over real HTTP, from a service whose worker applies packets at once."""
 
-import time
 from contextlib import closing
 
 import numpy as np
@@ -14,7 +13,9 @@ from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.keys import Server
 from fcslam.wire.packets import encode
 from tests.cloud.space_fleet import sent
+from tests.maps.test_joint_tiles import known_cells
 from tests.service.http.desk import SCRIPT, A, B, Desk
+from tests.waiting import wait_for
 
 
 @pytest.fixture
@@ -39,11 +40,6 @@ def follow(fleet):
         if fleet.version == before:
             return fleet
     raise AssertionError("it never ends")
-
-
-def known(occupancy):
-    column, row = (round(edge / occupancy.resolution_m) for edge in occupancy.origin_xy)
-    return {(row + y, column + x): occupancy.cells[y, x] for y, x in zip(*np.nonzero(occupancy.cells), strict=True)}
 
 
 def test_each_robot_of_a_map_gets_its_frontiers_and_the_page_those_of_all_maps(desk):
@@ -86,11 +82,11 @@ def test_robots_in_one_map_have_the_same_joint_map_and_it_is_that_of_the_service
     desk.send("a", A)
     with closing(view(desk, "a")) as first:
         follow(first)
-        alone = known(first.joint_map)
+        alone = known_cells(first.joint_map)
         desk.send("b", B)
         with closing(view(desk, "b", limit_kBps=0.5)) as second:
             follow(first), follow(second)
-            assert known(first.joint_map) == known(second.joint_map) != alone
+            assert known_cells(first.joint_map) == known_cells(second.joint_map) != alone
             assert [mate.robot for mate in first.robots()] == ["a", "b"]
             assert first.map_index == second.map_index == 0
             other = first.robots()[1]
@@ -135,7 +131,7 @@ def test_a_new_frame_shows_no_map_before_all_its_tiles_came(desk):
         follow(fleet)
         with closing(view(desk, "a", limit_kBps=1e6)) as at_once:
             at_once.step()
-            assert known(fleet.joint_map) == known(at_once.joint_map)
+            assert known_cells(fleet.joint_map) == known_cells(at_once.joint_map)
 
 
 def test_a_robot_that_is_taken_out_leaves_the_map_with_one_event(desk):
@@ -171,10 +167,7 @@ def test_following_goes_on_through_an_outage(desk):
     both = FleetClient(Server(f"http://127.0.0.1:9,{desk.client.base_url}", "token of a"))
     with closing(FleetView(both, "a", lambda: None)) as fleet:
         fleet.start()
-        until = time.monotonic() + 120.0
-        while fleet.joint_map is None and time.monotonic() < until:
-            time.sleep(0.02)
-        assert fleet.joint_map is not None
+        wait_for(lambda: fleet.joint_map is not None)
 
 
 def test_a_robot_reads_no_other_robots_map_and_says_nothing_for_it(desk):

@@ -13,8 +13,9 @@ from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
 from fcslam.mission.localization import read_map
 from tests import small_fleet
 from tests.carmen_logs import write_carmen
+from tests.lidar.worlds import Recording
 from tests.live.same_thread import SameThread
-from tests.robot.test_map_localizer import Recorded, errors, map_of
+from tests.robot.test_map_localizer import errors, map_of
 
 pytestmark = pytest.mark.slow
 
@@ -50,7 +51,7 @@ def test_the_poses_are_those_of_a_recording(fleet, building, scans, tmp_path):
         saved = robot.save(tmp_path / "run")
         with pytest.raises(InputError, match="finished"):
             drive(robot, scans[-1:])
-    recorded = fcslam.localize(Recorded("anna", scans), building).localized["anna"]
+    recorded = fcslam.localize(Recording(scans, "anna"), building).localized["anna"]
     known = recorded.is_localized
     assert [pose.is_localized for pose in poses] == known.tolist()
     assert np.allclose([pose.T_map_base for pose in poses], recorded.T_map_base, atol=1e-3, equal_nan=True)

@@ -16,7 +16,7 @@ from fcslam.live.robot import Robot
 from fcslam.maps.occupancy_map import Occupancy
 from fcslam.mission.driving import front_end_of
 from fcslam.records import Channel, CloudScan, LaserScan, Place
-from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.outbox import Outbox
 from fcslam.wire.keys import Server
 from fcslam.wire.messages import Hello
@@ -215,8 +215,7 @@ def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
         drive(tmp_path, Network(cloud), stop_after(scans, len(scans) - 5))
     seen = []
     robot = drive(tmp_path, Network(cloud), scans, resume=True, watch=lambda now: seen.append(now.localization))
-    frontend = RobotFrontend("alice", RobotConfig())
-    said = [packet for scan in scans for packet in frontend.process(scan)] + frontend.finish()
+    _, said = small_fleet.driven(scans, name="alice")
     assert {packet.epoch for packet in said} == {0, 1}
     assert [content(data) for data in cloud.stored.values()] == [content(data) for data in contents(said)]
     assert list(cloud.stored) == [(packet.epoch, packet.sequence) for packet in said]

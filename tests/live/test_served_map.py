@@ -20,6 +20,7 @@ from fcslam.page.routes import run_page
 from fcslam.runs import RobotTrajectory, Run
 from fcslam.wire.fleet_client import MapClient
 from fcslam.wire.keys import Server
+from tests.small_fleet import contents
 
 pytestmark = pytest.mark.slow
 
@@ -89,10 +90,10 @@ def test_an_earlier_copy_serves_while_the_cloud_cannot_be_reached(floors, tmp_pa
         fetch_maps(tmp_path / "copy", Server(NOBODY))
     assert not (tmp_path / "copy").exists()
     fetch_maps(tmp_path / "copy", Server(floors))
-    before = {path: path.read_bytes() for path in (tmp_path / "copy").rglob("*") if path.is_file()}
+    before = contents(tmp_path / "copy")
     assert "127.0.0.1:9" in fetch_maps(tmp_path / "copy", Server(NOBODY))
     assert fetch_maps(tmp_path / "copy", Server(f"{NOBODY},{floors}")) is None
-    assert {path: path.read_bytes() for path in (tmp_path / "copy").rglob("*") if path.is_file()} == before
+    assert contents(tmp_path / "copy") == before
 
 
 def test_a_new_copy_replaces_the_earlier_one(tmp_path):

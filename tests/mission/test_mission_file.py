@@ -14,17 +14,14 @@ from fcslam.cloud.edits import kind_of
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.errors import InputError, SourceError
 from fcslam.mission.localization import read_map
-from fcslam.mission.mission_file import edit_mission, mission_bytes, read_mission
+from fcslam.mission.mission_file import edit_mission, read_mission
 from fcslam.records import Cut, FloorLabel, ManualClosure, MapRegion, Pin, RegionUse, Removal, Undo, Veto
 from fcslam.runs import open_run
+from tests.small_fleet import contents
 
 pytestmark = pytest.mark.slow
 
 GOLDEN = Path(__file__).parent / "golden" / "mission_8.fcslam"
-
-
-def contents(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -115,12 +112,6 @@ def test_vetoes_stay_in_force(logs, tmp_path):
     assert not any(c.status is fcslam.ClosureStatus.ACCEPTED for c in between)
 
 
-def test_the_settings_of_the_cloud_are_kept(logs, tmp_path):
-    fcslam.map_recordings(logs[:2], output=tmp_path / "alone", config={"fleet": {"join_maps": False}})
-    run = fcslam.map_recordings([], onto=tmp_path / "alone")
-    assert len({trajectory.map_index for trajectory in run.trajectories.values()}) == 2
-
-
 def test_a_mission_file_survives_the_run_folder(begun, tmp_path):
     open_run(begun).save(tmp_path / "copy")
     assert (tmp_path / "copy" / "mission.fcslam").read_bytes() == (begun / "mission.fcslam").read_bytes()
@@ -140,22 +131,6 @@ def test_what_is_no_mission_file_is_told_in_one_line_and_stays_as_it_is(tmp_path
             assert "disk full" not in str(refused.value)
             assert path.read_bytes() == content
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(("empty", "text", *shares))
-
-
-def test_reading_is_the_inverse_of_writing(begun, tmp_path):
-    saved = read_mission(begun)
-    packets = sorted(saved.stored, key=lambda packet: packet.order)
-    path = tmp_path / "again"
-    path.write_bytes(mission_bytes(saved.config, saved.edits, packets, saved.refused, saved.tracks))
-    again = read_mission(path)
-    assert again.config == saved.config == CloudConfig()
-    assert [s.data for sent in again.packets.values() for s in sent] == [
-        s.data for sent in saved.packets.values() for s in sent
-    ]
-    assert again.tracks.keys() == saved.tracks.keys()
-    for name, track in saved.tracks.items():
-        assert again.tracks[name].stamps.tobytes() == track.stamps.tobytes()
-        assert again.tracks[name].T_keyscan_base.tobytes() == track.T_keyscan_base.tobytes()
 
 
 def test_the_golden_mission_means_what_it_says():

@@ -4,7 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from fcslam.geometry import se2
+from fcslam.metrics.trajectory import align, position_errors
 from fcslam.records import LaserScan, frozen
 from tests.lidar.worlds import LASER, box, drifting, drive, path, ranges
 
@@ -68,7 +68,5 @@ def ride(*seeds, closed_s=8.0, laser=LASER, odometry=True, change=None, seed=0):
 
 def errors_m(track, truth):
     """Distances (N,) of the poses of a session from the truth (N, 3), after one rigid alignment."""
-    found, true = track.T_odom_base()[:, :2], truth[:, :2]
-    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
-    turn = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
-    return np.hypot(*(se2.transform(np.array((0.0, 0.0, turn)), a) - b).T)
+    found = track.T_odom_base()
+    return position_errors(align(truth, found), truth, found)

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.metrics.trajectory import align
+from fcslam.metrics.trajectory import PositionErrors, align, position_errors
 from fcslam.records import LaserModel, LaserScan, Sweep, frozen
 from tests.lidar.worlds import box, cast
 
@@ -61,5 +61,4 @@ def error_m(track):
     """Absolute trajectory error of a robot's poses: root mean square of the distances after the best alignment."""
     stamps = np.asarray(track.stamps)
     estimated, true = track.T_odom_base(), pose_at(np.where(stamps < BEGIN_S, stamps, stamps - BEGIN_S))
-    aligned = se2.compose(align(true, estimated), estimated)
-    return float(np.sqrt(np.mean(np.sum((aligned - true)[:, :2] ** 2, axis=1))))
+    return PositionErrors.of(position_errors(align(true, estimated), true, estimated)).rmse_m

@@ -42,8 +42,7 @@ class Held(SameThread):
 
 
 def driven(scans, backend=None):
-    robot = RobotFrontend("r", CONFIG, backend)
-    return robot, [packet for scan in scans for packet in robot.process(scan)] + robot.finish()
+    return small_fleet.driven(scans, CONFIG, backend=backend)
 
 
 def contents(packets):

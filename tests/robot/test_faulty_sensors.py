@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2
-from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.wheel_odometry import FROZEN
 from tests import small_fleet
@@ -21,11 +20,7 @@ def robot():
 
 
 def drive(scans):
-    frontend = RobotFrontend("r", RobotConfig())
-    for scan in scans:
-        frontend.process(scan)
-    frontend.finish()
-    return frontend
+    return small_fleet.driven(scans)[0]
 
 
 def errors_m(robot, track):

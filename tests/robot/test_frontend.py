@@ -18,17 +18,12 @@ from fcslam.records import (
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet
+from tests.small_fleet import driven
 
 
 @pytest.fixture(scope="module")
 def scans():
     return list(small_fleet.draw(1, path_length_m=12.0).robots[0].scans())
-
-
-def drive(scans):
-    frontend = RobotFrontend("r", RobotConfig())
-    packets = [packet for scan in scans for packet in frontend.process(scan)]
-    return frontend, packets + frontend.finish()
 
 
 def bodies(packets, kind):
@@ -37,7 +32,7 @@ def bodies(packets, kind):
 
 @pytest.mark.slow
 def test_packets_are_numbered_timed_and_survive_the_wire(scans):
-    _, packets = drive(scans)
+    _, packets = driven(scans)
     assert [packet.sequence for packet in packets] == list(range(len(packets)))
     assert {(packet.robot, packet.epoch) for packet in packets} == {("r", 0)}
     assert all(np.diff([packet.time for packet in packets]) >= 0.0)
@@ -52,11 +47,11 @@ def test_broken_images_cause_no_packet_and_change_none(scans):
     seen = [CameraImage(scan.stamp, bytes(5000), camera, scan.T_odom_base) for scan in scans]
     assert RobotFrontend("r", RobotConfig()).process(seen[0]) == []
     both = [record for pair in zip(scans, seen, strict=True) for record in pair]
-    assert [encode(packet) for packet in drive(both)[1]] == [encode(packet) for packet in drive(scans)[1]]
+    assert [encode(packet) for packet in driven(both)[1]] == [encode(packet) for packet in driven(scans)[1]]
 
 
 def test_every_keyscan_is_followed_by_the_motion_that_leads_to_it(scans):
-    _, packets = drive(scans)
+    _, packets = driven(scans)
     chain = [
         body
         for body in (packet.body for packet in packets)
@@ -69,7 +64,7 @@ def test_every_keyscan_is_followed_by_the_motion_that_leads_to_it(scans):
 
 
 def test_places_name_keyscans_that_were_sent_before(scans):
-    _, packets = drive(scans)
+    _, packets = driven(scans)
     sent = -1
     assert bodies(packets, Place)
     for packet in packets:
@@ -82,7 +77,7 @@ def test_places_name_keyscans_that_were_sent_before(scans):
 
 
 def test_every_scan_has_a_pose_on_a_keyscan(scans):
-    frontend, packets = drive(scans)
+    frontend, packets = driven(scans)
     assert [pose.stamp for pose in frontend.scan_poses] == [scan.stamp for scan in scans]
     keyscans = bodies(packets, Keyscan)
     at = {keyscan.stamp: keyscan.id.number for keyscan in keyscans}
@@ -102,13 +97,13 @@ def test_ranges_between_two_steps_of_the_wire_make_no_difference(scans):
         replace(s, ranges_m=frozen(s.ranges_m + rng.uniform(-0.0008, 0.0008, len(s.ranges_m)), np.float32))
         for s in rounded
     ]
-    expected = [encode(packet) for packet in drive(rounded)[1]]
-    assert [encode(packet) for packet in drive(jittered)[1]] == expected
+    expected = [encode(packet) for packet in driven(rounded)[1]]
+    assert [encode(packet) for packet in driven(jittered)[1]] == expected
 
 
 def test_time_on_packets_never_goes_back(scans):
     back = [replace(scan, stamp=scan.stamp - (0.9 if k % 7 == 3 else 0.0)) for k, scan in enumerate(scans)]
-    _, packets = drive(back)
+    _, packets = driven(back)
     assert all(np.diff([packet.time for packet in packets]) >= 0.0)
     for packet in packets:
         encode(packet)  # no keyscan is later than its packet
@@ -120,7 +115,7 @@ def test_scans_that_see_nothing_do_not_stop_a_robot(scans, blind):
     """Covered at the start, dazzled on the way, or blind for all time."""
     seen = list(scans)
     seen[blind] = [replace(s, ranges_m=frozen(np.full_like(s.ranges_m, np.nan), np.float32)) for s in seen[blind]]
-    frontend, packets = drive(seen)
+    frontend, packets = driven(seen)
     keyscans = bodies(packets, Keyscan)
     assert len(frontend.scan_poses) == len(scans)
     assert keyscans

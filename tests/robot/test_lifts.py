@@ -7,7 +7,8 @@ import pytest
 
 from fcslam.lidar.lifts import Cabin
 from fcslam.records import Channel, LaserModel, LaserScan, frozen
-from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.frontend import RobotConfig
+from tests import small_fleet
 from tests.lidar.worlds import LASER, box, ranges
 from tests.robot.lifting import CABIN, DOOR, INSIDE, errors_m, ride
 
@@ -19,12 +20,8 @@ NOT_ALL_AROUND = LaserModel(271, -np.deg2rad(135.0), np.deg2rad(1.0), 25.0)
 AHEAD = LaserModel(181, -np.deg2rad(90.0), np.deg2rad(1.0), 25.0)
 
 
-def driven(scans, config=ROBOT):
-    robot = RobotFrontend("r", config)
-    for scan in scans:
-        robot.process(scan)
-    robot.finish()
-    return robot.tracks
+def driven(scans):
+    return small_fleet.driven(scans, ROBOT)[0].tracks
 
 
 @pytest.mark.parametrize(

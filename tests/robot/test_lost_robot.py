@@ -22,9 +22,7 @@ BLIND = RobotConfig(channels=LIDAR, lost=LostConfig(doubted=0.0))
 
 
 def driven(records, config=ROBOT):
-    robot = RobotFrontend("r", config)
-    packets = [packet for record in records for packet in robot.process(record)]
-    return robot, packets + robot.finish()
+    return small_fleet.driven(records, config)
 
 
 def test_a_kidnapped_robot_begins_anew_where_it_was_put_down():

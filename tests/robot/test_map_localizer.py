@@ -17,6 +17,7 @@ from fcslam.records import Keyscan, KeyscanId
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.map_localizer import MapLocalizer
 from tests import small_fleet
+from tests.lidar.worlds import Recording
 from tests.robot.kidnapping import put_down
 
 pytestmark = pytest.mark.slow
@@ -34,16 +35,6 @@ def map_of(robots):
                 keyscans.append(Keyscan(KeyscanId(robot.name, number), scan.stamp, scan.ranges_m))
                 poses.append(robot.T_building_base[number])
     return fuse(keyscans, np.array(poses), {robot.name: robot.lasers for robot in robots}, OccupancyConfig())
-
-
-class Recorded:
-    """A recording of scans in memory."""
-
-    def __init__(self, name, scans):
-        self.name, self._scans = name, list(scans)
-
-    def records(self):
-        return iter(self._scans)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +56,7 @@ def errors(poses, robot):
 
 
 def localized(scans, occupancy, name="robot", **options):
-    return run_localization(Recorded(name, scans), FinishedMap(occupancy), MissionConfig(), **options)
+    return run_localization(Recording(list(scans), name), FinishedMap(occupancy), MissionConfig(), **options)
 
 
 def test_a_robot_is_found_without_an_initial_pose(fleet, building):

@@ -10,6 +10,7 @@ from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
 from tests.lidar.worlds import ranges, room
+from tests.small_fleet import driven
 
 POSE = (0.5, 0.0, 0.3)
 
@@ -24,8 +25,7 @@ def scan_of(model):
 
 def mapped(*scans):
     """The announced lasers, and the first keyscan."""
-    frontend = RobotFrontend("r", RobotConfig())
-    packets = [packet for scan in scans for packet in frontend.process(scan)] + frontend.finish()
+    _, packets = driven(scans)
     hello, keyscan = (decode(encode(packet)).body for packet in packets[:2])
     assert isinstance(hello, Hello)
     return hello.lasers, keyscan

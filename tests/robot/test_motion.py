@@ -13,6 +13,7 @@ from fcslam.robot.calibrating import calibrate_bag, calibrated
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source, write_bag
 from tests.robot import spinning
+from tests.small_fleet import driven
 
 pytestmark = pytest.mark.slow
 
@@ -29,12 +30,6 @@ def integrated(scale=1.0, turn=1.0, slip=None):
     known = np.array(poses)
     known[:, 2] = np.unwrap(known[:, 2])
     return lambda stamp: np.array([np.interp(stamp, ticks, axis) for axis in known.T])
-
-
-def mapped(scans, config=None):
-    frontend = RobotFrontend("r", config or RobotConfig())
-    packets = [packet for scan in scans for packet in frontend.process(scan)]
-    return frontend, packets + frontend.finish()
 
 
 def held(odometry):
@@ -81,7 +76,7 @@ def test_a_bag_of_a_scanner_that_spins_maps_a_room(tmp_path, odometry, delay_s):
     items = sorted([*readings, *spinning.drive()], key=lambda item: item.stamp)
     write_bag(tmp_path / "r.mcap", [replace(item, stamp=item.stamp + spinning.BEGIN_S) for item in items])
     config = RobotConfig()
-    frontend, packets = mapped(calibrated(open_source(tmp_path / "r.mcap"), config.lidar).records(), config)
+    frontend, packets = driven(calibrated(open_source(tmp_path / "r.mcap"), config.lidar).records(), config)
     assert len(frontend.tracks) == 1
     assert spinning.error_m(frontend.tracks[0]) < 0.02
     keyscans = [packet.body for packet in packets if isinstance(packet.body, Keyscan)]
@@ -104,7 +99,7 @@ def test_without_odometry_the_motion_shows_the_times_of_beams_that_a_bag_does_no
     bag = open_source(tmp_path / "r.mcap")
     sweep = calibrate_bag(bag, LidarConfig()).correction.sweep
     assert sweep is None if first_s == last_s else sweep == pytest.approx((first_s, last_s), abs=0.003)
-    frontend, _ = mapped(calibrated(bag, LidarConfig()).records())
+    frontend, _ = driven(calibrated(bag, LidarConfig()).records())
     assert len(frontend.tracks) == 1
     assert spinning.error_m(frontend.tracks[0]) < 0.01
 
@@ -118,22 +113,22 @@ def test_a_drive_along_one_circle_fixes_no_mounting(tmp_path, monkeypatch):
     readings = [Odometry(t, frozen(circle(t))) for t in READINGS.tolist()]
     items = sorted([*readings, *spinning.drive()], key=lambda item: item.stamp)
     write_bag(tmp_path / "r.mcap", [replace(item, stamp=item.stamp + spinning.BEGIN_S) for item in items])
-    frontend, _ = mapped(calibrated(open_source(tmp_path / "r.mcap"), LidarConfig()).records())
+    frontend, _ = driven(calibrated(open_source(tmp_path / "r.mcap"), LidarConfig()).records())
     assert spinning.error_m(frontend.tracks[0]) < 0.02
 
 
 def test_the_duration_of_a_scan_can_be_a_setting():
     config = RobotConfig(lidar=LidarConfig(scan_duration_s=spinning.SWEEP_S))
-    frontend, _ = mapped(spinning.drive(odometry=spinning.pose_at, states_sweep=False), config)
+    frontend, _ = driven(spinning.drive(odometry=spinning.pose_at, states_sweep=False), config)
     assert len(frontend.tracks) == 1
     assert spinning.error_m(frontend.tracks[0]) < 0.03
 
 
 @pytest.mark.parametrize("begin_s", [1.0, 1.6, 4.0])
 @pytest.mark.parametrize(("rate_hz", "most_m"), [(7.0, 0.005), (5.0, 0.01), (4.0, 0.025)])
-def test_without_odometry_a_robot_that_begins_in_a_turn_is_mapped(begin_s, rate_hz, most_m):
+def test_without_odometry_a_robot_that_begins_in_a_turn_is_driven(begin_s, rate_hz, most_m):
     """It turns at up to 1.6 rad/s, so by 0.4 rad during a scan, and brakes at 2 rad/s^2."""
-    frontend, _ = mapped(spinning.drive(begin_s=begin_s, scan_s=1.0 / rate_hz))
+    frontend, _ = driven(spinning.drive(begin_s=begin_s, scan_s=1.0 / rate_hz))
     assert len(frontend.tracks) == 1
     assert len(frontend.tracks[0]) == round(20.0 * rate_hz)
     assert spinning.error_m(frontend.tracks[0]) < most_m
@@ -143,7 +138,7 @@ def test_without_odometry_a_robot_that_begins_in_a_turn_is_mapped(begin_s, rate_
 def test_without_odometry_a_robot_put_into_another_room_during_its_drive_is_lost(at_s):
     elsewhere = spinning.WALLS * (1.3, 1.5, 1.3, 1.5) + (0.5, 1.0, 0.5, 1.0)
     drives = spinning.drive(at_s), spinning.drive(14.0, begin_s=at_s, walls=elsewhere)
-    frontend, _ = mapped(scan for part in drives for scan in part)
+    frontend, _ = driven(scan for part in drives for scan in part)
     assert [len(track) * spinning.SCAN_S for track in frontend.tracks] == pytest.approx([at_s, 14.0], abs=0.4)
     assert spinning.error_m(frontend.tracks[1]) < 0.01
 
@@ -160,7 +155,7 @@ def test_without_odometry_a_robot_that_drives_on_in_gaps_of_its_scans_is_found_a
     scans = list(spinning.drive(25.0))
     for gap in gaps:
         scans = cut(scans, *gap)
-    frontend, _ = mapped(scans)
+    frontend, _ = driven(scans)
     assert sum(len(track) for track in frontend.tracks) == len(scans)
     assert len(frontend.tracks) == 1 or len(gaps) == 2
     assert all(spinning.error_m(track) < 0.01 * len(gaps) for track in frontend.tracks)
@@ -170,7 +165,7 @@ def test_without_odometry_a_robot_that_drives_on_in_gaps_of_its_scans_is_found_a
 def test_after_a_long_gap_without_odometry_a_robot_must_be_where_it_was(moved_s, sessions):
     """It moves by 2.5 m."""
     later = (replace(scan, stamp=scan.stamp + 60.0 - moved_s) for scan in spinning.drive(8.0, begin_s=9.0 + moved_s))
-    frontend, _ = mapped([*spinning.drive(9.0), *later])
+    frontend, _ = driven([*spinning.drive(9.0), *later])
     assert len(frontend.tracks) == sessions
 
 
@@ -181,14 +176,14 @@ def test_the_first_scan_without_odometry_has_a_pose_before_the_second_comes():
     np.testing.assert_array_equal(frontend.scan_poses.in_odom(frontend.newest.pose), np.zeros(3))
     assert {type(packet.body) for packet in frontend.process(scans[1])} >= {Keyscan}
     assert not frontend.newest.is_deferred
-    alone, packets = mapped(scans[:1])
+    alone, packets = driven(scans[:1])
     assert len(alone.scan_poses) == 1
     assert sum(isinstance(packet.body, Keyscan) for packet in packets) == 1
 
 
 def test_a_robot_at_rest_keeps_its_odometry():
     scan = next(iter(spinning.drive(odometry=spinning.pose_at)))
-    frontend, _ = mapped([scan] * 40)
+    frontend, _ = driven([scan] * 40)
     assert frontend.motion.model.is_measured
     assert len(frontend.tracks) == 1
 

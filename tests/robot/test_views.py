@@ -18,6 +18,7 @@ from fcslam.wire.packets import encode
 from tests.features.networks import tiny_network
 from tests.features.pictures import image_at
 from tests.lidar.worlds import drifting, drive, path, recording, ring
+from tests.small_fleet import driven
 
 pytestmark = pytest.mark.slow
 
@@ -50,8 +51,7 @@ def seen():
 
 
 def bodies_of(records, config=RobotConfig()):  # noqa: B008 - frozen
-    frontend = RobotFrontend("r", config)
-    packets = [packet for record in records for packet in frontend.process(record)] + frontend.finish()
+    _, packets = driven(records, config)
     return [packet.body for packet in packets], packets
 
 
@@ -221,8 +221,7 @@ def test_corridors_that_repeat_themselves_join_nothing_by_their_images_alone():
     config, cloud = RobotConfig(channels=(Channel.CAMERA,)), Cloud(FleetConfig(), 0)
     for number, start in enumerate((0.0, 24.0)):
         records, _ = records_of([(start, 0.0), (start + 9.0, 0.0)], 10 + number, walls, lambda number: number // count)
-        robot = RobotFrontend(f"r{number}", config)
-        packets = [packet for record in records for packet in robot.process(record)] + robot.finish()
+        _, packets = driven(records, config, f"r{number}")
         assert any(isinstance(packet.body, Place) for packet in packets)
         for packet in packets:
             cloud.receive(encode(packet))

@@ -7,7 +7,7 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.records import CameraImage, CameraModel, Channel, LaserModel, LaserScan, Transform, frozen
-from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.wheel_odometry import WheelOdometry
 from tests import small_fleet
 
@@ -108,10 +108,7 @@ def test_a_robot_maps_on_through_spikes(far_m):
         read[k] = replace(scans[k], T_odom_base=frozen(away))
 
     def mapped(records):
-        frontend = RobotFrontend("r", RobotConfig(channels=(Channel.LIDAR,)))
-        for record in records:
-            frontend.process(record)
-        frontend.finish()
+        frontend, _ = small_fleet.driven(records, RobotConfig(channels=(Channel.LIDAR,)))
         assert len(frontend.tracks) == 1
         return frontend, frontend.scan_poses.T_odom_base()
 

@@ -1,24 +1,24 @@
 """The systemd unit of docs/howto/deploy.md, and the service under the restrictions that it asks for."""
 
 import configparser
+import contextlib
 import os
 import re
 import shlex
 import shutil
 import signal
-import socket
 import ssl
 import subprocess
 import sys
-import time
-import urllib.error
-import urllib.request
 from pathlib import Path
 
+import httpx
 import pytest
 from numba.core.caching import UserProvidedCacheLocator
 
 from fcslam.cli import main
+from tests.postgres import free_port
+from tests.waiting import wait_for
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 300.0
@@ -83,8 +83,7 @@ def test_the_service_of_the_unit_runs_under_its_restrictions(tmp_path):
     cache.mkdir()
     lay_code(cache)
     assert main(["tools", "certificates", "--host", "localhost", "--viewer", "lab", "-o", str(etc)]) == 0
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
     places = {"/var/lib/fcslam": state, "/etc/fcslam": etc, "0.0.0.0": "127.0.0.1"}
     program, *arguments = shlex.split(service["ExecStart"])
     assert program.endswith("/fcslam")
@@ -97,26 +96,22 @@ def test_the_service_of_the_unit_runs_under_its_restrictions(tmp_path):
     command = [sys.executable, "-m", "fcslam.cli", *arguments, "--port", str(port)]
     trusted = ssl.create_default_context(cafile=etc / "ca.pem")
 
-    def ask(path, token=None):
-        request = urllib.request.Request(f"https://localhost:{port}{path}")
-        if token:
-            request.add_header("Authorization", f"Bearer {token}")
-        with urllib.request.urlopen(request, context=trusted, timeout=10) as answer:
-            return answer.status
+    def ask(path, token="none"):
+        asked = {"Authorization": f"Bearer {token}"}
+        return httpx.get(f"https://localhost:{port}{path}", headers=asked, verify=trusted, timeout=10.0).status_code
+
+    def is_ready():
+        with contextlib.suppress(httpx.TransportError):
+            return ask("/healthz") == 200
+        assert process.poll() is None, process.stderr.read()
+        return False
 
     with subprocess.Popen(
         ["unshare", "--mount", "--propagation", "private", "sh", "-c", script, "sh", *command],
         env=environment, cwd="/", stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         try:
-            until = time.monotonic() + PATIENCE_S
-            while time.monotonic() < until and process.poll() is None:
-                try:
-                    if ask("/healthz") == 200:
-                        break
-                except (urllib.error.URLError, ConnectionError, TimeoutError):
-                    time.sleep(0.5)
-            assert process.poll() is None, process.stderr.read()
+            wait_for(is_ready, PATIENCE_S)
             token = (etc / "users" / "lab" / "token").read_text().strip()
             assert ask("/api/v1/fleet", token) == 200
             process.send_signal(signal.SIGHUP)  # ExecReload

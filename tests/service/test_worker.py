@@ -23,7 +23,6 @@ from fcslam.geometry import se3
 from fcslam.mission.mission import MissionConfig, run_mission
 from fcslam.mission.mission_store import MissionStore, StoredPacket
 from fcslam.records import ClosureStatus, Constraint, ConstraintKind, FloorLabel, Place, Removal, Undo, Veto
-from fcslam.robot.frontend import RobotFrontend
 from fcslam.runs import open_run
 from fcslam.service.joint_maps import read_joint_maps
 from fcslam.service.mission_folder import KEPT, MissionFolder
@@ -35,7 +34,6 @@ from fcslam.service.worker import (
     MOST_CRASHES,
     QUALITY_EVERY_S,
     SNAPSHOT_EVERY_S,
-    CrashLog,
     Worker,
 )
 from fcslam.sources import open_source
@@ -44,7 +42,7 @@ from fcslam.wire.packets import encode, read_label
 from tests.cloud.space_fleet import sent as sent_in_space
 from tests.scripted import closures, motion, rectangle, stream
 from tests.service.inline import InlineTask
-from tests.small_fleet import in_order
+from tests.small_fleet import driven, in_order
 
 pytestmark = pytest.mark.slow
 
@@ -56,11 +54,6 @@ def stored(packet, data=None):
     content = encode(packet) if data is None else data
     label = read_label(content)
     return StoredPacket(packet.robot, packet.epoch, packet.sequence, packet.time, label.kind, label.channel, content)
-
-
-def sent(source, config):
-    frontend = RobotFrontend(source.name, config)
-    return [packet for record in source.records() for packet in frontend.process(record)] + frontend.finish()
 
 
 class Cloud:
@@ -123,7 +116,8 @@ def expected(robots="ab"):
 
 def test_the_service_finds_what_the_mission_finds_in_the_same_recordings(tmp_path, logs):
     config = MissionConfig(seed=3)
-    packets = in_order(packet for log in logs[:2] for packet in sent(open_source(log), config.robot))
+    recorded = [open_source(log) for log in logs[:2]]
+    packets = in_order(p for log in recorded for p in driven(log.records(), config.robot, log.name)[1])
     expected = run_mission([open_source(log) for log in logs[:2]], config)
     cloud = Cloud(tmp_path / "mission", config.cloud)
     rng = np.random.default_rng(11)
@@ -679,27 +673,3 @@ def test_refusals_are_stored_together_and_outlive_the_worker(cloud):
     cloud.work()
     assert cloud.store.refused("c").count == 2 * AT_ONCE
     assert len(cloud.store.refusals("c")) == 100, "the last ones, however many there are"
-
-
-def test_a_worker_goes_on_within_a_queue(cloud):
-    packets = flood("c", 9 * AT_ONCE, start_s=0.0)
-    cloud.put(packets)
-    cloud.tick = 0.0
-    cloud.worker.step()
-    cloud.now += SNAPSHOT_EVERY_S
-    cloud.worker.step()
-    assert cloud.folder.snapshot.exists(), "although packets wait"
-    applied, cloud.tick = [], 1.0
-    cloud.restart(hosts(lambda packet: applied.append(packet.sequence)))
-    cloud.work()
-    assert applied == list(range(AT_ONCE, len(packets))), "no packet twice"
-    assert cloud.store.refused("c").count == 9 * AT_ONCE
-
-
-def test_a_task_that_a_worker_survived_is_no_longer_suspect(tmp_path):
-    for _ in range(MOST_CRASHES - 1):
-        CrashLog(tmp_path / "task").begin("packet 1 of a")
-    log = CrashLog(tmp_path / "task")
-    for task in ("packet 1 of a", "packet 2 of a", "packet 1 of a"):  # an edit lets packets be applied again
-        log.begin(task)
-    assert not CrashLog(tmp_path / "task").is_fatal("packet 1 of a")

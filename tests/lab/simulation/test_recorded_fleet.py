@@ -6,23 +6,20 @@ import pytest
 
 from fcslam.cli import main
 from tests.full_disk import largest_file
+from tests.small_fleet import contents
 
 FLEET = ["--building", "flat", "--path-length", "4", "--robots", "2", "--no-camera", "--seed", "2"]
 COMMAND = ["tools", "simulate", *FLEET]
-
-
-def files(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.slow
 def test_the_same_command_writes_the_same_bytes_and_no_folder_twice(tmp_path, capsys):
     for name in ("one", "two"):
         assert main([*COMMAND, "--output", str(tmp_path / name)]) == 0
-    assert files(tmp_path / "one") == files(tmp_path / "two")
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
     assert main([*COMMAND, "--output", str(tmp_path / "one")]) == 2
     assert "is not empty; choose another place" in capsys.readouterr().err
-    assert files(tmp_path / "one") == files(tmp_path / "two")
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
 
 
 def test_a_full_disk_is_one_line_and_leaves_no_half_recording(tmp_path, capsys):
@@ -30,4 +27,4 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_recording(tmp_path, capsys):
         assert main([*COMMAND, "--output", str(tmp_path / "full")]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "cannot be written (File too large)" in line
-    assert files(tmp_path / "full").keys() == {Path("simulation.yaml")}
+    assert contents(tmp_path / "full").keys() == {Path("simulation.yaml")}

@@ -104,11 +104,6 @@ def test_furniture_moves_before_every_robot_but_the_first():
     assert np.any(moved.robots[1].plan.segments != still.plan.segments)
 
 
-def test_too_many_robots_for_the_building():
-    with pytest.raises(InputError, match=r"'flat'.* too small for 50 robots; simulate at most \d"):
-        simulate_fleet(TINY.model_copy(update={"robots": 50}), 1)
-
-
 def test_without_a_gl_library_one_line_says_what_to_install(monkeypatch):
     engine.mujoco()
     real = importlib.import_module

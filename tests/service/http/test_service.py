@@ -23,6 +23,7 @@ from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import decode, encode, readdress
 from tests.scripted import LASER, ScriptedMatcher
 from tests.service.http.desk import SCRIPT, A, B, Desk, put_detector
+from tests.small_fleet import contents
 
 pytestmark = pytest.mark.slow
 
@@ -205,10 +206,7 @@ def test_a_result_can_be_downloaded(mapped, tmp_path):
     archive = mapped.ask("GET", answer["archive"], "boss")
     assert archive.headers["content-type"] == "application/zip"
     zipfile.ZipFile(io.BytesIO(archive.content)).extractall(tmp_path / "run")
-    folder = Path(answer["run"])
-    written = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    there = tmp_path / "run"
-    assert {path.relative_to(there): path.read_bytes() for path in there.rglob("*") if path.is_file()} == written
+    assert contents(tmp_path / "run") == contents(Path(answer["run"]))
     assert mapped.ask("GET", answer["archive"], "eye").status_code == 403
     assert mapped.ask("GET", f"{API}/missions/mission/runs/99.zip", "boss").status_code == 404
     assert mapped.ask("GET", f"{API}/missions/other/runs/1.zip", "boss").status_code == 404
