@@ -6,9 +6,10 @@ import pytest
 from fcslam.geometry import se2
 from fcslam.maps.occupancy_map import Occupancy, parse_map
 from fcslam.mission.mission import MissionConfig, run_mission
-from fcslam.records import Beams, LaserModel, LaserScan, frozen
+from fcslam.records import Beams, LaserModel
 from fcslam.wire.messages import Hello
-from tests.lidar.worlds import Recording, box, drifting, drive, path, pose_errors, ranges, ring, ring_drive
+from tests.lidar.worlds import Recording, box, drifting, drive, path, pose_errors, recording, ring, ring_drive
+from tests.small_fleet import driven
 
 pytestmark = pytest.mark.slow
 
@@ -24,16 +25,6 @@ def interleaved(number):
 def jittering(number):
     count = 360 + (7 * number) % 23 - 11
     return TURN.with_beams(Beams(count - (number % 5 == 0), -np.pi, 2.0 * np.pi / count))
-
-
-def recorded(poses, odometry, world, laser_of):
-    rng = np.random.default_rng(3)
-    found = []
-    for k, (pose, by_wheels) in enumerate(zip(poses, odometry, strict=True)):
-        laser = laser_of(k)
-        measured = ranges(pose, world, laser, 0.015, rng)[0]
-        found.append(LaserScan(100.0 + 0.2 * k, frozen(measured, np.float32), laser, frozen(by_wheels)))
-    return found
 
 
 def mapped(scans):
@@ -53,10 +44,9 @@ def odometry(truth):
 
 @pytest.mark.parametrize("laser_of", [interleaved, jittering])
 def test_a_scanner_whose_beams_vary_maps_as_well_as_one_whose_do_not(truth, odometry, laser_of):
-    steady = laser_of(4)
     errors = {}
-    for name, laser in (("varying", laser_of), ("steady", lambda _: steady)):
-        run, poses = mapped(recorded(truth, odometry, ring(), laser))
+    for name, laser in (("varying", laser_of), ("steady", laser_of(4))):
+        run, poses = mapped(recording(truth, odometry, ring(), laser, seed=3))
         errors[name] = pose_errors(poses, truth)[0].mean()
         assert run.metrics["intra_robot_closures_accepted"].value > 0
     assert errors["varying"] < 1.15 * errors["steady"] + 0.005
@@ -65,6 +55,10 @@ def test_a_scanner_whose_beams_vary_maps_as_well_as_one_whose_do_not(truth, odom
 
 REAR = LaserModel(181, -np.pi / 2, np.deg2rad(1.0), 20.0, (-0.2, 0.0, np.pi))
 FRONT = LaserModel(181, -np.pi / 2, np.deg2rad(1.0), 20.0, (0.2, 0.0, 0.0))
+
+
+def in_turn(number):
+    return (FRONT, REAR)[number % 2]
 
 
 def hall():
@@ -77,7 +71,7 @@ def two_lasers():
     """A drive straight ahead, with each laser alone and with both in turn."""
     poses = drive([(0.0, 0.0), (5.0, 0.3)], step_m=0.05)
     odometry = drifting(poses, np.random.default_rng(1))
-    both = recorded(poses, odometry, hall(), lambda k: (FRONT, REAR)[k % 2])
+    both = recording(poses, odometry, hall(), in_turn, seed=3)
     return poses, both
 
 
@@ -105,10 +99,7 @@ def test_the_map_of_two_lasers_has_what_only_one_of_them_saw(two_lasers):
 
 
 def test_a_laser_is_announced_before_its_first_keyscan(two_lasers):
-    from fcslam.robot.frontend import RobotConfig, RobotFrontend
-
-    frontend = RobotFrontend("r", RobotConfig())
-    bodies = [packet.body for scan in two_lasers[1] for packet in frontend.process(scan)]
+    bodies = [packet.body for packet in driven(two_lasers[1])[1]]
     hellos = [body.lasers for body in bodies if isinstance(body, Hello)]
     assert hellos == [(FRONT,), (FRONT, REAR)]
     lasers = [body.laser for body in bodies if hasattr(body, "ranges_m")]
@@ -119,6 +110,6 @@ def test_a_laser_is_announced_before_its_first_keyscan(two_lasers):
 def test_a_laser_that_always_scans_just_after_the_other_is_matched_too():
     """The robot moves by less than ``still_m`` in between, so only odometry could tell the second pose."""
     truth = np.repeat(drive([(0.0, 0.0), (5.0, 0.3)], step_m=0.1), 2, axis=0)
-    scans = recorded(truth, truth, hall(), lambda k: (FRONT, REAR)[k % 2])
+    scans = recording(truth, truth, hall(), in_turn, seed=3)
     run, poses = mapped(scans)
     assert occupied_near(run, poses, -6.0, truth) > 40

@@ -85,8 +85,12 @@ def gtsam_optimum(
 ) -> tuple[np.ndarray, float]:
     """The poses (N, 3) of GTSAM, and their cost."""
     problem, values = gtsam_problem(graph, start, loss, priors)
+    found = exactly_solved(problem, values)
+    return gtsam.utilities.extractPose2(found), problem.error(found)
+
+
+def exactly_solved(problem: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(0.0)
     parameters.setAbsoluteErrorTol(0.0)
-    found = gtsam.LevenbergMarquardtOptimizer(problem, values, parameters).optimize()
-    return gtsam.utilities.extractPose2(found), problem.error(found)
+    return gtsam.LevenbergMarquardtOptimizer(problem, start, parameters).optimize()

@@ -17,7 +17,7 @@ from fcslam.graph.optimizer import optimize, optimize_gnc
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.graph.single_robot import solve_single_robot
 from fcslam.graph.trajectory import build_trajectory
-from tests.graph.graph_worlds import manhattan
+from tests.graph.graph_worlds import exactly_solved, manhattan
 
 pytestmark = pytest.mark.slow
 
@@ -67,10 +67,7 @@ def gtsam_optimum(graph: PoseGraph, loss: Loss) -> tuple[np.ndarray, float]:
         problem.push_back(gtsam.BetweenFactorPose3(int(edges.i[k]), int(edges.j[k]), pose3(edges.T_i_j[k]), model))
     exact = noise.Gaussian.Information(1e8 * np.eye(6), False)
     problem.push_back(gtsam.PriorFactorPose3(0, pose3(graph.poses()[0]), exact))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(0.0)
-    parameters.setAbsoluteErrorTol(0.0)
-    found = gtsam.LevenbergMarquardtOptimizer(problem, values, parameters).optimize()
+    found = exactly_solved(problem, values)
     return np.array([se3.from_matrix(found.atPose3(k).matrix()) for k in range(len(graph))]), problem.error(found)
 
 

@@ -134,12 +134,13 @@ def drifting(poses, rng, scale=1.02, veer_rad_m=0.01, noise=0.01):
 
 
 def recording(poses, odometry, segments, laser=LASER, *, noise_m=0.015, seed=0):
-    """Laser scans of a drive, one each 0.2 s."""
-    found = ranges(poses, segments, laser, noise_m, np.random.default_rng(seed))
-    return [
-        LaserScan(100.0 + 0.2 * k, frozen(row, np.float32), laser, frozen(pose))
-        for k, (row, pose) in enumerate(zip(found, odometry, strict=True))
-    ]
+    """Laser scans of a drive, one each 0.2 s; ``laser``: of all scans, or a function of a scan's number."""
+    rng, scans = np.random.default_rng(seed), []
+    for k, (pose, by_wheels) in enumerate(zip(poses, odometry, strict=True)):
+        own = laser(k) if callable(laser) else laser
+        (row,) = ranges(pose, segments, own, noise_m, rng)
+        scans.append(LaserScan(100.0 + 0.2 * k, frozen(row, np.float32), own, frozen(by_wheels)))
+    return scans
 
 
 class Recording:

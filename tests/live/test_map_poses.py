@@ -11,7 +11,6 @@ from fcslam.geometry import se2, se3
 from fcslam.geometry.groups import compose
 from fcslam.live.map_poses import CorrectedOdometry, MapPoses
 from fcslam.records import Correction, Keyscan
-from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet
 from tests.wire.examples import CORRECTION
@@ -21,8 +20,7 @@ from tests.wire.examples import CORRECTION
 def driven():
     """A robot's packets, and the track of its scans."""
     robot = small_fleet.draw(1, path_length_m=12.0).robots[0]
-    frontend = RobotFrontend(robot.name, RobotConfig())
-    packets = [packet for scan in robot.scans() for packet in frontend.process(scan)]
+    frontend, packets = small_fleet.driven(robot.scans(), name=robot.name)
     return packets, frontend.scan_poses
 
 

@@ -97,7 +97,7 @@ def test_closures_between_robots_are_drawn():
 def test_of_very_many_closures_the_shortest_that_lie_apart_are_drawn():
     fused, ways = walled(120, 300, (0.0, 0.0), 0.5), {"a": way((30, 15), (120, 15)), "b": way((30, 45), (120, 45))}
     generator = np.random.default_rng(0)
-    starts = generator.uniform((0.0, 0.0), (150.0, 60.0), (20_000, 2))
+    starts = generator.uniform((0.0, 0.0), (150.0, 60.0), (4_000, 2))
     ends = starts + generator.normal(size=starts.shape)
     closures = list(np.stack((starts, ends), axis=1))
     all_of_them = seen(map_png(fused, ways, closures))
@@ -108,7 +108,7 @@ def test_of_very_many_closures_the_shortest_that_lie_apart_are_drawn():
         if (np.linalg.norm(middles - middle, axis=1) > CLOSURES_APART_M).all():
             middles, kept = np.vstack((middles, middle)), [*kept, closure]
     above_legend = slice(-2 * LINE_HEIGHT_PX)
-    assert 1000 < len(kept) < 10_000
+    assert 1000 < len(kept) < 3000
     assert np.array_equal(all_of_them[above_legend], seen(map_png(fused, ways, kept))[above_legend])
 
 

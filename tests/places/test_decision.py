@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from functools import cache
 
 import numpy as np
 import pytest
@@ -51,9 +52,10 @@ def eq_4(x, y):
     return 2 * sum(x.get(w, 0.0) + y.get(w, 0.0) - abs(x.get(w, 0.0) - y.get(w, 0.0)) for w in {*x, *y})
 
 
-def algorithm_1(all_codes, delta):
-    """{(i, j): Sim} of all pairs of two robots with M_ij = 1; the k-means trees are those of the index."""
-    index, matches = PlaceIndex[int](PAPER.vocabulary, np.random.default_rng(0)), {}
+@cache
+def similarities():
+    """{(i, j): Sim} of all pairs of two robots; the k-means trees are those of the index."""
+    index, found, all_codes = PlaceIndex[int](PAPER.vocabulary, np.random.default_rng(0)), {}, scenes(seed=1)
     for j, codes in enumerate(all_codes):
         if index.trained_on is not None:
             tree = index.vocabulary.tree
@@ -61,27 +63,24 @@ def algorithm_1(all_codes, delta):
             documents = Counter(word for of_place in words for word in set(of_place))
             query = bag([walk(tree, code) for code in codes.view(np.uint64)], documents, j)
             for i in range(1 - j % 2, j, 2):
-                sim = eq_4(query, bag(words[i], documents, j))
-                if sim >= delta:
-                    matches[i, j] = sim
+                found[i, j] = eq_4(query, bag(words[i], documents, j))
         index.add(j, codes)
-    return matches
+    return found
 
 
 @pytest.mark.parametrize("delta", [0.3, 0.85, 2.0])
 def test_the_words_decide_as_in_algorithm_1(delta):
-    all_codes = scenes(seed=1)
     matcher = PlaceMatcher(PAPER.model_copy(update={"delta": delta}), no_submap, np.random.default_rng(0))
     found = {}
-    for j, codes in enumerate(all_codes):
+    for j, codes in enumerate(scenes(seed=1)):
         for match in matcher.match(place(j, codes), {}, lambda i, j=j: i.robot != "ab"[j % 2]):
             found[match.i.number, match.j.number] = match
-    expected = algorithm_1(all_codes, delta)
+    expected = {pair: sim for pair, sim in similarities().items() if sim >= delta}
     assert found.keys() == expected.keys()
     assert [4 * match.similarity for match in found.values()] == pytest.approx([expected[pair] for pair in found])
     assert all(match.M and match.reason.code is ReasonCode.SIMILAR for match in found.values())
     assert min(j for _, j in found) > L, "before the first vocabulary nothing is compared"
-    assert 0 < len(expected) < sum(1 for j in range(L + 2, PLACES) for _ in range(1 - j % 2, j, 2))
+    assert 0 < len(expected) < len(similarities())
 
 
 def no_submap(place):
