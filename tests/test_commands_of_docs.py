@@ -222,7 +222,7 @@ def answer(url: str, process: subprocess.Popen[str]) -> bytes:
     def read() -> bytes | None:
         try:
             return httpx.get(url, timeout=10.0).raise_for_status().content
-        except httpx.TransportError:
+        except httpx.HTTPError:
             assert process.poll() is None
             return None
 
