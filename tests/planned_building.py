@@ -1,13 +1,17 @@
 """A building with walls, its plan, and a map of it by ideal scans."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 
+from fcslam.anchoring.anchors import anchored
+from fcslam.cloud.report import fuse_members
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
+from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import Keyscan, KeyscanId, LaserModel, frozen
 from tests.lidar.worlds import ranges
@@ -105,3 +109,9 @@ def off_m(placing, true):
     """Distance of each pose from the truth."""
     (robot,) = placing.result.robots
     return np.hypot(*(robot.T_map_base[:, :2] - true[:, :2]).T)
+
+
+def anchored_map(result, anchors, by_hand=()):
+    """A result in the coordinates of the building, and its files."""
+    placed, files = anchored(result, anchors, by_hand, lambda members: fuse_members(members, OccupancyConfig()))
+    return SimpleNamespace(result=placed, files=files)

@@ -7,24 +7,22 @@ import cv2
 import numpy as np
 import pytest
 
-from fcslam.anchoring.anchors import Anchors, anchored, anchoring_lines, read_anchors
+from fcslam.anchoring.anchors import Anchors, anchoring_lines, read_anchors
 from fcslam.anchoring.plan import BuildingPlan
 from fcslam.anchoring.plan_files import read_plan
-from fcslam.cloud.report import fuse_members
 from fcslam.config import parse_yaml
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
-from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
-from tests.planned_building import OTHER_WALLS, WALLS, mapped, off_m, plan_of
+from tests.planned_building import OTHER_WALLS, WALLS, anchored_map, mapped, off_m, plan_of
 
 pytestmark = pytest.mark.slow
 
 
 def placed(result, plan=None, by_hand=()):
     anchors = Anchors(BuildingPlan(plan) if isinstance(plan, OccupancyMap) else plan)
-    return anchored(result, anchors, by_hand, lambda members: fuse_members(members, OccupancyConfig()))
+    return anchored_map(result, anchors, by_hand)
 
 
 def report_of(placing):

@@ -6,15 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.anchoring.anchors import Anchors, anchored, anchoring_lines
+from fcslam.anchoring.anchors import Anchors, anchoring_lines
 from fcslam.anchoring.part import ROUNDS, Positions, part_of
 from fcslam.anchoring.surveyed_tags import read_survey
-from fcslam.cloud.report import fuse_members
 from fcslam.errors import SourceError
 from fcslam.geometry import se2
-from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.records import KeyscanId, Tag, TagFamily, TagSighting, frozen
-from tests.planned_building import mapped, off_m
+from tests.planned_building import anchored_map, mapped, off_m
 
 FAMILY = TagFamily.APRILTAG_36H11
 WALL_TAGS = {1: (4.9, 1.0, np.pi), 2: (2.0, 5.9, -np.pi / 2), 3: (9.9, 1.0, np.pi), 4: (15.9, 2.0, np.pi),
@@ -37,10 +35,7 @@ def sightings(true, tags=WALL_TAGS, scale=1.0, robot="anna", rows=slice(None)):
 
 
 def placed(result, seen, survey=None, by_hand=()):
-    return anchored(
-        replace(result, sightings=seen), Anchors(survey=survey), by_hand,
-        lambda members: fuse_members(members, OccupancyConfig()),
-    )  # fmt: skip
+    return anchored_map(replace(result, sightings=seen), Anchors(survey=survey), by_hand)
 
 
 def lines(placing):

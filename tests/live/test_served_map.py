@@ -18,7 +18,7 @@ from fcslam.mission.localization import read_finished, read_map
 from fcslam.page.report import ShownRun
 from fcslam.page.routes import run_page
 from fcslam.runs import RobotTrajectory, Run
-from fcslam.wire.fleet_client import MapClient
+from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.keys import Server
 from tests.small_fleet import contents
 
@@ -124,7 +124,7 @@ def test_a_map_that_the_cloud_draws_anew_meanwhile_is_read_again(floors, tmp_pat
     """The list of maps is older than the files once, then always."""
     answers = []
 
-    def maps(client, original=MapClient.maps):
+    def maps(client, original=FleetClient.maps):
         answers.append(original(client))
         is_old = len(answers) == 1 or len(answers) > 2
         return [replaced(one) for one in answers[-1]] if is_old else answers[-1]
@@ -132,7 +132,7 @@ def test_a_map_that_the_cloud_draws_anew_meanwhile_is_read_again(floors, tmp_pat
     def replaced(one):
         return one.model_copy(update={"extent_m": (one.extent_m[0] - 0.05, *one.extent_m[1:])})
 
-    monkeypatch.setattr(MapClient, "maps", maps)
+    monkeypatch.setattr(FleetClient, "maps", maps)
     assert fetch_maps(tmp_path / "copy", Server(floors)) is None
     assert len(answers) == 2
     assert "its maps change all the time" in fetch_maps(tmp_path / "copy", Server(floors))

@@ -43,7 +43,7 @@ def test_closures_and_diagnostics(network, published):
     published.closures(1, np.array([[[0.0, 0.0], [1.0, 2.0]]]))
     (markers,) = network.sent["/robot1/closures"]
     assert [(point.x, point.y) for point in markers.markers[0].points] == [(0.0, 0.0), (1.0, 2.0)]
-    published.diagnostics(1, "anna", "lost", {"scans": 3})
+    published.diagnostics(1, "anna", "lost", {"scans": 3}, "mapping")
     (array,) = network.sent["/diagnostics"]
     assert array.status[0].name == "fcslam: anna"
     assert (array.status[0].level, array.status[0].message) == (1, "lost")

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,6 @@ from fcslam.records import StrPath
 
 if TYPE_CHECKING:
     from fcslam.anchoring.alignment import PlanAlignment
-    from fcslam.anchoring.gnss import Georeference
     from fcslam.anchoring.plan import BuildingPlan
     from fcslam.anchoring.plan_fit import PlanFit
     from fcslam.anchoring.surveyed_tags import Survey
@@ -68,17 +67,10 @@ def read_anchors(plan: StrPath | None = None, plan_scale: float | None = None, t
     return Anchors(building, None if tags is None else read_survey(Path(tags)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Anchored:
-    """A result in the coordinates of the building or of the earth."""
-
-    result: FleetResult
-    files: Mapping[str, bytes] = field(default_factory=dict)
-    """Files of the run folder about it, by name."""
-
-
-def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fuse: FuseMembers) -> Anchored:
-    """Place each map by the floor plan, else by surveyed tags, else by fixes.
+def anchored(
+    result: FleetResult, anchors: Anchors, placed: Collection[int], fuse: FuseMembers
+) -> tuple[FleetResult, dict[str, bytes]]:
+    """Place each map by the floor plan, else by surveyed tags, else by fixes; and the run folder's files about it.
 
     Maps that a user ``placed`` stay about there. ``fuse`` draws a map.
     """
@@ -86,7 +78,7 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
     from fcslam.anchoring.gnss import georeferenced
     from fcslam.anchoring.part import part_of, with_part
     from fcslam.anchoring.plan_fit import fit_to_plan, map_submap
-    from fcslam.anchoring.surveyed_tags import MapTags, placed_by_tags
+    from fcslam.anchoring.surveyed_tags import MapTags, placed_by_tags, survey_report
 
     files: dict[str, bytes] = {}
     reports, pictures = [], []
@@ -108,19 +100,17 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
             else:
                 reports.append({"map": k, "aligned": False, "reason": _refusal(anchors.plan, building, alignment)})
         in_plan = alignment is not None and not alignment.refusal
-        by_tags = False
+        fixed = "it keeps the frame of its plan" if in_plan else "it was placed by hand" if is_placed else ""
         if anchors.survey is not None:
-            if in_plan or is_placed:
-                reason = "it keeps the frame of its plan" if in_plan else "it was placed by hand"
-                surveyed.append({"map": k, "reason": reason, "used": [], "ignored": {}})
-            else:
-                found_tags = placed_by_tags(part, result.sightings, anchors.survey)
-                part, by_tags = found_tags.part, not found_tags.refusal
-                surveyed.append({"map": k, **found_tags.report()})
-        found = georeferenced(part, is_fixed=in_plan or is_placed or by_tags)
+            by_tags = survey_report(fixed)
+            if not fixed:
+                part, by_tags = placed_by_tags(part, result.sightings, anchors.survey)
+                fixed = "" if by_tags["reason"] else "it lies in the survey"
+            surveyed.append({"map": k, **by_tags})
+        found = georeferenced(part, is_fixed=bool(fixed))
         if found is not None:
-            part = found.part
-            files[map_stem(k) + GEOREFERENCE] = _json(_geo_report(found))
+            part, report = found
+            files[map_stem(k) + GEOREFERENCE] = _json(report)
         result = with_part(result, k, part)
         seen = MapTags(part.robots, result.sightings)
         tags += seen.report(k)
@@ -132,7 +122,7 @@ def anchored(result: FleetResult, anchors: Anchors, placed: Collection[int], fus
         drawing = anchors.plan.drawing
         files[PLAN_JSON] = _json({"maps": reports, "drawing": outlines(drawing.cells == Occupancy.OCCUPIED, drawing)})
         files[PLAN_PNG] = _picture(drawing, pictures)
-    return Anchored(result, files)
+    return result, files
 
 
 def _refusal(plan: "BuildingPlan", building: Submap | None, alignment: "PlanAlignment | None") -> str:
@@ -176,21 +166,6 @@ def _plan_report(k: int, alignment: "PlanAlignment", fit: "PlanFit") -> dict[str
 def _rmf(plan: "BuildingPlan", floors: Sequence[str]) -> dict[str, bytes]:
     """The file for Open-RMF, if robots on these floors are in maps that lie in the plan."""
     return {RMF_YAML: rmf_yaml(plan.drawing, plan.is_picture, floors[0] or FIRST_LEVEL).encode()} if floors else {}
-
-
-def _geo_report(found: "Georeference") -> dict[str, object]:
-    counts: dict[str, float] = {"fixes": found.fixes, "ignored": found.ignored}
-    counts |= {"sigma_m": round(found.sigma_m, 4), "stated_sigma_m": round(found.stated_sigma_m, 4)}
-    if found.refusal:
-        return {"georeferenced": False, "reason": found.refusal, **counts}
-    return {
-        "georeferenced": True,
-        "latitude_deg": round(found.latitude_deg, 9),
-        "longitude_deg": round(found.longitude_deg, 9),
-        "altitude_m": round(found.altitude_m, 3),
-        "x_axis_from_east_deg": round(float(np.degrees(found.heading_rad)), 6),
-        **counts,
-    }
 
 
 def _json(content: object) -> bytes:

@@ -40,29 +40,6 @@ _MEDIAN_OFF: Final = 1.1774
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Georeference:
-    """Where one map lies on the earth."""
-
-    part: MapPart
-    fixes: int
-    """Fixes at a scan of the map."""
-    ignored: int
-    """Fixes that contradict the others."""
-    refusal: str = ""
-    """Why the map is not placed; empty if it is."""
-    sigma_m: float = 0.0
-    """Standard deviation of the fixes that agree, by their distances from the path."""
-    stated_sigma_m: float = 0.0
-    """The same as the receiver states it."""
-    latitude_deg: float = 0.0
-    """Latitude of the map's origin; the longitude and altitude are also those of the origin."""
-    longitude_deg: float = 0.0
-    altitude_m: float = 0.0
-    heading_rad: float = 0.0
-    """Direction of the map's x axis, counter-clockwise from east."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Measured(Positions):
     """Positions of antennas, metres east and north."""
 
@@ -77,22 +54,27 @@ class _Measured(Positions):
         return off
 
 
-def georeferenced(part: MapPart, is_fixed: bool) -> Georeference | None:
+def georeferenced(part: MapPart, is_fixed: bool) -> tuple[MapPart, dict[str, Any]] | None:
     """Place a map on the earth, conclusively or not at all; None if it has no fix.
 
     A map that ``is_fixed`` keeps its frame and its poses; another one is turned so that x is east and y is north.
+
+    Returns:
+        The map, and what its file says: where it lies or why it is not placed, the fixes and those that contradict the
+        others, and the standard deviation of the fixes by their distances from the path and as the receiver states it.
     """
     robots = part.robots
     kept = [fix for robot in robots for fix in robot.fixes]
     if not kept:
         return None
+    report: dict[str, Any] = {"fixes": len(kept), "ignored": 0, "sigma_m": 0.0, "stated_sigma_m": 0.0}
     at = [np.array([fix.id.number for fix in robot.fixes], np.int64) for robot in robots]
     stated_m = np.array([fix.sigma_m for fix in kept])
     positions = np.array([(fix.latitude_deg, fix.longitude_deg) for fix in kept])
     try:
         projection, east_north = _projected(positions)
     except ImportError:
-        return Georeference(part, len(kept), 0, "fixes need pyproj; install it: pip install 'fcslam[gnss]'")
+        return part, _refused("fixes need pyproj; install it: pip install 'fcslam[gnss]'", report)
     gaps_s = np.concatenate([np.diff(np.sort(robot.stamps[rows])) for robot, rows in zip(robots, at, strict=True)])
     interval_s = float(np.median(gaps_s)) if len(gaps_s) else CORRELATED_S
     measured = _Measured(
@@ -111,16 +93,28 @@ def georeferenced(part: MapPart, is_fixed: bool) -> Georeference | None:
         if explanation := _explanation(measured, antennas, positions, 0 if refusal else count):
             refusal = f"{refusal or f'{count} of {len(agreeing)} fixes agree'}; {explanation}"
     sigma_m = float(np.median(measured.sigma_m))
-    sigmas_m = sigma_m, float(np.median(stated_m)) if measured.factor > 1.0 else sigma_m
+    stated_sigma_m = float(np.median(stated_m)) if measured.factor > 1.0 else sigma_m
+    report |= {"ignored": int((~agreeing).sum()), "sigma_m": round(sigma_m, 4)}
+    report["stated_sigma_m"] = round(stated_sigma_m, 4)
     if refusal:
-        return Georeference(part, len(kept), int((~agreeing).sum()), refusal, *sigmas_m)
+        return part, _refused(refusal, report)
     if not is_fixed:
         poses, agreeing = _solve(part.graph, se2.compose(T, poses), measured, agreeing)
         part, T = part.at(poses), np.zeros(3)
     longitude, latitude = projection(*T[:2].tolist(), inverse=True)
-    ignored = int((~agreeing).sum())
-    altitude_m = float(np.median([fix.altitude_m for fix in kept]))
-    return Georeference(part, len(kept), ignored, "", *sigmas_m, latitude, longitude, altitude_m, float(T[2]))
+    return part, {
+        "georeferenced": True,
+        "latitude_deg": round(latitude, 9),
+        "longitude_deg": round(longitude, 9),
+        "altitude_m": round(float(np.median([fix.altitude_m for fix in kept])), 3),
+        "x_axis_from_east_deg": round(float(np.degrees(T[2])), 6),
+        **report,
+        "ignored": int((~agreeing).sum()),
+    }
+
+
+def _refused(reason: str, report: dict[str, Any]) -> dict[str, Any]:
+    return {"georeferenced": False, "reason": reason, **report}
 
 
 def _projected(positions: FloatArray) -> tuple[Any, FloatArray]:

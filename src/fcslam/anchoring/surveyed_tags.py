@@ -183,44 +183,36 @@ class MapTags:
         return float(weights @ (arms**2).sum(axis=1)), float(weights @ (arms * off).sum(axis=1))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Surveyed:
-    """A map in the coordinates of surveyed tags."""
+def survey_report(reason: str, used: Sequence[Tag] = (), off_m: Mapping[Tag, float] | None = None) -> dict[str, Any]:
+    """What ``tags.json`` says about a map and the survey: why it is not placed, or by which tags.
 
-    part: MapPart
-    used: tuple[Tag, ...]
-    off_m: Mapping[Tag, float]
-    """How far each surveyed tag that was seen is from where it should be."""
-    refusal: str = ""
-    """Why the map is not placed; empty if it is."""
-
-    def report(self) -> dict[str, Any]:
-        """What ``tags.json`` says about it."""
-        ignored = {str(tag.number): round(off_m, 3) for tag, off_m in self.off_m.items() if tag not in self.used}
-        return {"reason": self.refusal, "used": [tag.number for tag in self.used], "ignored": ignored}
+    ``off_m``: how far each surveyed tag that was seen is from where it should be.
+    """
+    ignored = {str(tag.number): round(its_m, 3) for tag, its_m in (off_m or {}).items() if tag not in used}
+    return {"reason": reason, "used": [tag.number for tag in used], "ignored": ignored}
 
 
-def placed_by_tags(part: MapPart, sightings: Sequence[TagSighting], survey: Survey) -> Surveyed:
+def placed_by_tags(part: MapPart, sightings: Sequence[TagSighting], survey: Survey) -> tuple[MapPart, dict[str, Any]]:
     """Place a map by surveyed tags, and straighten it. Tags that are not where they should be do not count."""
     tags = MapTags(part.robots, sightings)
     known = [tag for tag in tags.places if tag in survey]
     if not known:
-        return Surveyed(part, (), {}, "no robot in it saw a surveyed tag")
+        return part, survey_report("no robot in it saw a surveyed tag")
     seen = {tag: tags.places[tag][0].pose for tag in known}
     T, used = _aligned(seen, survey)
     if T is None:
-        return Surveyed(part, (), {}, _why_not_aligned(seen, survey))
+        return part, survey_report(_why_not_aligned(seen, survey))
     start = se2.compose(T, part.graph.poses())
     while True:
         # Of two tags, no third one shows which is wrong, and the solution would bend the map between them.
         if len(used) == 2 and abs(np.subtract(*_distances_m(seen, survey, *used))) > 2.0 * LARGEST_OFF_M:
-            return Surveyed(part, (), {}, _contradiction(seen, survey, *used))
+            return part, survey_report(_contradiction(seen, survey, *used))
         moved = part.at(_solve(part.graph, start, tags, used, survey))
         places = MapTags(moved.robots, sightings).places
         off_m = {tag: float(np.hypot(*(places[tag][0].pose[:2] - np.array(survey[tag][:2])))) for tag in known}
         worst = max(used, key=lambda tag: off_m[tag])
         if off_m[worst] <= LARGEST_OFF_M or len(used) <= 2:
-            return Surveyed(moved, tuple(used), off_m)
+            return moved, survey_report("", used, off_m)
         used = [tag for tag in used if tag != worst]
 
 

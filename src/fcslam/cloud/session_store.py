@@ -227,15 +227,13 @@ class SessionStore:
             if not kept.holders:
                 kept.keyscan, kept.is_released = None, True
 
-    def keyscans(self, robot: str, first: int = 0, last: int | None = None) -> tuple[Keyscan, ...]:
-        """Connected keyscans first to last (inclusive) of a robot, without released ones."""
-        session = self._sessions[robot]
-        end = session.connected if last is None else last + 1
-        kept = (self._keyscan(robot, number) for number in range(first, end))
+    def keyscans(self, robot: str) -> tuple[Keyscan, ...]:
+        """Connected keyscans of a robot, without released ones."""
+        kept = (self._keyscan(robot, number) for number in range(self._sessions[robot].connected))
         return tuple(keyscan for keyscan in kept if keyscan is not None)
 
     def numbers(self, robot: str, first: int = 0, last: int | None = None) -> NDArray[np.int64]:
-        """Numbers of the ``keyscans``, shape (N,)."""
+        """Numbers of the ``keyscans`` from the first to the last one (inclusive), shape (N,)."""
         session = self._sessions[robot]
         end = session.connected if last is None else min(last + 1, session.connected)
         return np.array([k for k in range(first, end) if not session.keyscans[k].is_released], np.int64)

@@ -12,7 +12,7 @@ from fcslam.maps.occupancy_map import area_of, map_stem, parse_map
 from fcslam.records import FloatArray, frozen
 from fcslam.runs import RobotTrajectory, Run, prepare_output
 from fcslam.runs.folder import MISSION, is_run_folder
-from fcslam.wire.fleet_client import MapClient
+from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.fleet_replies import ServedMap
 from fcslam.wire.http_transport import addresses
 from fcslam.wire.keys import Server
@@ -34,7 +34,7 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
     prepare_output(folder, force=True)
     troubles = []
     for address in addresses(server.url):
-        with closing(MapClient(replace(server, url=address))) as client:
+        with closing(FleetClient(replace(server, url=address))) as client:
             try:
                 _read(client, address).save(folder, force=True)
                 return None
@@ -46,7 +46,7 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
     return trouble
 
 
-def _read(client: MapClient, server: str) -> Run:
+def _read(client: FleetClient, server: str) -> Run:
     for _ in range(_ATTEMPTS):
         served = [one for one in client.maps() if one.extent_m is not None]
         if not served:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fcslam.robot.frontend3d import RobotFrontend3d
 
 SCANS_PER_LEG: Final = 50
+"""Also the scans between two reports of progress."""
 LEGS_PER_TRIM: Final = 4
 """Legs after which freed memory goes back to the system: the arrays of a submap leave gaps that others do not fill."""
 MOST_WAITING: Final = 64

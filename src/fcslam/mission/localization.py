@@ -23,7 +23,7 @@ from fcslam.maps.drawing import map_png
 from fcslam.maps.joint_voxels import read_points
 from fcslam.maps.occupancy_map import OccupancyMap, map_stem, parse_map, server_files
 from fcslam.maps.ros_map import read_ros_map
-from fcslam.mission.driving import front_end_of
+from fcslam.mission.driving import SCANS_PER_LEG, front_end_of
 from fcslam.mission.mission import MissionConfig, MissionInputs, continued_config, run_mission
 from fcslam.mission.mission_file import read_mission
 from fcslam.records import FloatArray, LaserScan, checked_pose, frozen
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 
 MAP_YAML: Final = "map.yaml"
 """The first map of a run folder."""
-REPORTED_SCANS: Final = 50
-"""Scans between two reports of progress."""
 UPDATE_STEP_M: Final = 0.1
 """Least distance between two scans that are drawn into a finished map."""
 _BESIDE: Final = 5
@@ -131,7 +129,7 @@ def run_localization(
 ) -> Run:
     """Localize a robot in a map, as ``fcslam.localize`` does; ``initial`` is its ``initial_pose``, shape (3,).
 
-    ``progress`` is called every ``REPORTED_SCANS`` scans.
+    ``progress`` is called every ``SCANS_PER_LEG`` scans.
     """
     occupancy = finished.occupancy
     localizer = MapLocalizer(frozen_map(occupancy, "the map"), initial)
@@ -160,7 +158,7 @@ def run_localization(
         # 2. Place the new scans in the map.
         before = len(drive)
         _place(robot, (in_space or localizer).estimate, drive)
-        if len(drive) // REPORTED_SCANS > before // REPORTED_SCANS:
+        if len(drive) // SCANS_PER_LEG > before // SCANS_PER_LEG:
             progress(LocalizationProgress(len(drive), localizer.estimate is not None, drive.quality))
     losses = localizer.losses  # without the end of the recording
     robot.finish()

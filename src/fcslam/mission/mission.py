@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydantic import Field
 
-from fcslam.anchoring.anchors import Anchored, Anchors, anchored
+from fcslam.anchoring.anchors import Anchors, anchored
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.edits import in_force
 from fcslam.cloud.report import Track, fuse_members, keyscan_track, run_of, traffic_metrics
@@ -176,17 +176,17 @@ class MissionCloud:
         counts = (Metric("scans", scans, "1"), Metric("recorded_time", recorded_s, "s"))
         metrics = (*counts, *traffic_metrics(self._traffic, tracks))
         mission = mission_bytes(self.config.cloud, self.host.edits, self._packets, self._refused, tracks)
-        placing = self._placed(result)
-        run = run_of(placing.result, tracks, metrics, dump(self.config), self.config.map, measured=result.graph)
-        run = replace(run, map_files={**run.map_files, **placing.files})
+        placed, files = self._placed(result)
+        run = run_of(placed, tracks, metrics, dump(self.config), self.config.map, measured=result.graph)
+        run = replace(run, map_files={**run.map_files, **files})
         return replace(run, mission=mission)
 
-    def _placed(self, result: FleetResult) -> Anchored:
+    def _placed(self, result: FleetResult) -> tuple[FleetResult, dict[str, bytes]]:
         if self.config.fleet.dimensions == 3:  # what anchors say is of the plane
-            return Anchored(result)
+            return result, {}
         anchors, is_fixed = self._inputs.anchors, any(robot.fixes for robot in result.robots)
         if anchors == Anchors() and not is_fixed and not result.sightings:
-            return Anchored(result)
+            return result, {}
         by_hand = {change.session for change in in_force(self.host.edits) if isinstance(change, Placement)}
         placed = {robot.map_index for robot in result.robots if robot.robot in by_hand}
         return anchored(result, anchors, placed, lambda members: fuse_members(members, self.config.map))

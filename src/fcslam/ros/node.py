@@ -1,23 +1,20 @@
 """A live robot on a ROS network: reads its sensors, maps, and publishes map and pose.
 
 The thread that calls ``run`` reads messages. A second thread publishes ``map -> odom`` at a fixed rate. A third one
-publishes the map, the path and diagnostics, and saves the map. So none of them delays the pose of a scan.
+publishes the map, the path and diagnostics. So none of them delays the pose of a scan.
 """
 
-import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fcslam.config import one_line
 from fcslam.errors import FcslamError, InputError
-from fcslam.maps.occupancy_map import map_yaml, pgm_bytes
-from fcslam.records import NAME, CloudScan, FloatArray, LaserScan, SensorRecord
+from fcslam.records import CloudScan, FloatArray, LaserScan, SensorRecord
 from fcslam.ros.clock import CLOCK, CLOCK_TOPIC, RosClock, TransformStream
 from fcslam.ros.inbox import POLL_S, SILENCE_S, Inbox
 from fcslam.ros.live_plan import Notify
@@ -29,7 +26,6 @@ from fcslam.ros.topics import SensorTopics, choose_sensor_topics, resolved
 from fcslam.sources.bags.codec import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, LASER_SCANS, SCANS, MessageCodec
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.transforms import planar, transform_of
-from fcslam.storage.files import write_file
 
 if TYPE_CHECKING:
     from fcslam.live.fleet_view import FleetView
@@ -38,9 +34,7 @@ if TYPE_CHECKING:
     from fcslam.live.robot import Robot
 
 STRING, EMPTY = "std_msgs/String", "std_msgs/Empty"
-SAVE_MAP, FINISH, FLOOR, INITIAL_POSE = "fcslam/save_map", "fcslam/finish", "fcslam/floor", "initialpose"
-_NAMES_WAITING = 8
-"""Most maps that wait to be saved; anybody on the network may ask for them."""
+FINISH, FLOOR, INITIAL_POSE = "fcslam/finish", "fcslam/floor", "initialpose"
 _LINES_TOLD = 100
 """Largest number of different lines that are printed; the names in some come from the network."""
 _FLEET_PERIOD_S = 0.2
@@ -95,8 +89,6 @@ class RobotNode:
         self._suggest_pose, self._change_floor = suggest_pose, change_floor
         self._codec = MessageCodec(ros1=False)
         self._inbox = Inbox(notify=self._tell_once)
-        self._names: queue.Queue[str] = queue.Queue(_NAMES_WAITING)
-        """Names of the map files to save."""
         self._stop = threading.Event()
         self._told: set[str] = set()
         self.scans = 0
@@ -197,9 +189,8 @@ class RobotNode:
         self._outputs.points(stamp_ns, points)
 
     def _publish_fleet(self) -> None:
-        """Publish where the robots of the fleet are, at a fixed rate; frontiers, changes of the robot's map and how
-        good it is once."""
-        news, frontiers = 0, None
+        """Publish where the robots of the fleet are, at a fixed rate; frontiers, and how good the map is, once."""
+        frontiers = None
         quality: tuple[object, ...] = ()
         while not self._stop.wait(_FLEET_PERIOD_S):
             fleet = self._robot.fleet
@@ -213,9 +204,6 @@ class RobotNode:
             if fleet.quality != quality:
                 quality = fleet.quality
                 self._outputs.quality(now_ns, self._robot.name, quality)
-            for line in fleet.news[news:]:
-                news += 1
-                self._outputs.event(now_ns, self._robot.name, line)
 
     def _publish_frontiers(self, now_ns: int, fleet: "FleetView") -> None:
         found = [one for its in fleet.frontiers if its.map_index == fleet.map_index for one in its.frontiers]
@@ -253,16 +241,12 @@ class RobotNode:
         self._outputs.pose(stamp_ns, pose.pose, pose.covariance_6d)
 
     def _publish_transforms(self) -> None:
-        period_s = self._parameters.transform_publish_period
+        period_s, planner = self._parameters.transform_publish_period, self.sensors.planner
         due_s = time.monotonic()
         while not self._stop.wait(max(0.0, due_s - time.monotonic())):
             transform = self._transforms.due(self._clock.now_ns())
             if transform is not None:
-                child = (
-                    self.sensors.planner.base_frame
-                    if self.sensors.planner.is_without_odometry
-                    else self.sensors.planner.odom_frame
-                )
+                child = planner.base_frame if planner.is_without_odometry else planner.odom_frame
                 self._outputs.transform(transform[0], child, transform[1])
             due_s = max(due_s + period_s, time.monotonic() - period_s)
 
@@ -272,7 +256,6 @@ class RobotNode:
         while not self._stop.wait(1.0):
             self.watch_network()
             self.diagnose()
-            self._save_maps()
             may_be_new = self.scans != drawn or self._robot.fleet is not None  # what the others see comes in between
             if time.monotonic() < due_s or not may_be_new:
                 continue
@@ -281,7 +264,6 @@ class RobotNode:
                 self.publish_map()
             except Exception as error:  # this thread also tells the state of the robot, so it must not end
                 self._tell_once(f"a map cannot be published: {error or type(error).__name__}")
-        self._save_maps()
 
     def diagnose(self) -> None:
         """Publish the state of the robot."""
@@ -304,7 +286,6 @@ class RobotNode:
     def _subscribe(self) -> None:
         self._inbox.subscribe(self._network, self._topics.kinds, _DEPTHS, self._clock.now_ns)
         commands: list[tuple[str, str, Callable[[bytes], object], str]] = [
-            (SAVE_MAP, STRING, self._take_name, "the map cannot be saved"),
             (FINISH, EMPTY, lambda _: self.stop(), ""),
             (INITIAL_POSE, POSE, self._take_pose, "an initial pose is refused"),
             (FLOOR, STRING, self._take_floor, "a floor is refused"),
@@ -321,27 +302,8 @@ class RobotNode:
         """Do what a message asks for. Anybody on the network may send many, so each topic has one line of refusal."""
         try:
             command(payload)
-        except (ValueError, FcslamError, queue.Full) as error:
-            self._tell_once(f"{refusal}: {one_line(str(error)) or 'too many wait'}", refusal)
-
-    def _take_name(self, payload: bytes) -> None:
-        name = self._codec.decode(payload, STRING).data or self._robot.name
-        if not NAME.fullmatch(name):
-            raise ValueError(f"{name!r} is not a name; give letters, digits and . _ -, without a folder")
-        self._names.put_nowait(name)
-
-    def _save_maps(self) -> None:
-        """Write the files of map_server to this process's folder."""
-        while not self._names.empty():
-            name = self._names.get()
-            try:
-                occupancy = self._robot.map()
-                write_file(Path(f"{name}.pgm"), pgm_bytes(occupancy))
-                write_file(Path(f"{name}.yaml"), map_yaml(occupancy, f"{name}.pgm"))
-            except (OSError, FcslamError) as error:
-                self._notify(f"the map cannot be saved: {error}")
-            else:
-                self._notify(f"map saved: {Path(f'{name}.yaml').absolute()}")
+        except (ValueError, FcslamError) as error:
+            self._tell_once(f"{refusal}: {one_line(str(error))}", refusal)
 
     def _take_pose(self, payload: bytes) -> None:
         """Try a pose that somebody gives, as by RViz's "2D Pose Estimate"."""

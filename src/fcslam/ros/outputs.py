@@ -167,7 +167,18 @@ class Outputs:
         if before is not None and _is_same(before, occupancy):
             return False
         self._maps[topic] = occupancy
-        self._send(topic, GRID, self._grid_message(stamp_ns, occupancy), LATCHED)
+        height, width = occupancy.cells.shape
+        info = self._codec.make(
+            "nav_msgs/MapMetaData",
+            map_load_time=self._codec.time(stamp_ns),
+            resolution=occupancy.resolution_m,
+            width=width,
+            height=height,
+            origin=self._codec.pose(in_space(np.array((*occupancy.origin_xy, 0.0)))),
+        )
+        header = self._codec.header(stamp_ns, self._map_frame)
+        data = _GRID_VALUES[occupancy.cells].ravel()
+        self._send(topic, GRID, self._codec.make(GRID, header=header, info=info, data=data), LATCHED)
         return True
 
     def fleet(self, now_ns: int, teammates: "Sequence[TeammatePose]", own: int | None) -> None:
@@ -194,14 +205,7 @@ class Outputs:
             statuses.append(self._status(name, mate.robot, self._levels.OK, where, values))
         self._diagnose(FLEET_STATUS, now_ns, statuses)
 
-    def event(self, stamp_ns: int, robot: str, text: str) -> None:
-        """Publish one event of the fleet's map on the topic of diagnostics."""
-        status = self._status(f"fcslam: {robot}: fleet", robot, self._levels.OK, text, {"event": "fleet"})
-        self._diagnose(DIAGNOSTICS_TOPIC, stamp_ns, [status])
-
-    def diagnostics(
-        self, stamp_ns: int, robot: str, trouble: str, values: Mapping[str, object], well: str = "mapping"
-    ) -> None:
+    def diagnostics(self, stamp_ns: int, robot: str, trouble: str, values: Mapping[str, object], well: str) -> None:
         """Publish the state of the robot: ``trouble``, or ``well`` if that is empty."""
         level = self._levels.WARN if trouble else self._levels.OK
         status = self._status(f"fcslam: {robot}", robot, level, trouble or well, values)
@@ -249,19 +253,6 @@ class Outputs:
             color=make("std_msgs/ColorRGBA", r=r, g=g, b=b, a=0.8),
             points=[vector("Point", x, y) for x, y in points.reshape(-1, 2).tolist()],
         )
-
-    def _grid_message(self, stamp_ns: int, occupancy: OccupancyMap) -> Any:
-        height, width = occupancy.cells.shape
-        info = self._codec.make(
-            "nav_msgs/MapMetaData",
-            map_load_time=self._codec.time(stamp_ns),
-            resolution=occupancy.resolution_m,
-            width=width,
-            height=height,
-            origin=self._codec.pose(in_space(np.array((*occupancy.origin_xy, 0.0)))),
-        )
-        header = self._codec.header(stamp_ns, self._map_frame)
-        return self._codec.make(GRID, header=header, info=info, data=_GRID_VALUES[occupancy.cells].ravel())
 
     def _posed(self, stamp_ns: int, T_map_base: FloatArray) -> Any:
         header = self._codec.header(stamp_ns, self._map_frame)

@@ -34,26 +34,6 @@ STEPS_BACK_FOR_RESTART = 3
 """Number of scans in a row that are far back in time until the clock is taken to have stepped back."""
 
 
-class _Patience:
-    def __init__(self, longest_s: float) -> None:
-        self._longest_s = longest_s
-        self._since_s: float | None = None
-
-    def forget(self) -> None:
-        """What was awaited came."""
-        self._since_s = None
-
-    def is_over(self, is_waiting: bool, now_s: float) -> bool:
-        """Whether the wait goes on for too long; then it begins again."""
-        if not is_waiting or self._since_s is None:
-            self._since_s = now_s if is_waiting else None
-            return False
-        if now_s <= self._since_s + self._longest_s:
-            return False
-        self._since_s = None
-        return True
-
-
 class LiveSensors:
     """Reads the messages of one robot, one at a time."""
 
@@ -76,8 +56,8 @@ class LiveSensors:
         """Topics with scans of other frames, of which there was a line."""
         self._misplaced = 0
         self._next_image_s = -inf
-        self._odometry_patience = _Patience(ODOMETRY_PATIENCE_S)
-        self._laser_patience = _Patience(MERGING_PATIENCE_S)
+        self._waiting_since_s: dict[str, float] = {}
+        """Since when scans wait for other lasers, or for odometry."""
 
     def add(self, topic: str, payload: bytes, now_s: float, received_ns: int) -> Iterator[SensorRecord]:
         """Read the next message; yields the records that are complete at ``now_s`` of a clock that only grows.
@@ -114,17 +94,25 @@ class LiveSensors:
                 yield from self._read(message)
         reader = self._reader
         silent = reader.silent_lasers
-        if self._laser_patience.is_over(bool(silent), now_s):
+        if self._waits_too_long("lasers", bool(silent), now_s, MERGING_PATIENCE_S):
             for laser in silent:
                 self._notify(f"{self._topics.scans[laser]} is silent; the robot goes on with its other lasers")
             yield from self._recorded(reader.skip_lasers())
-        if self._odometry_patience.is_over(reader.waits_for_odometry, now_s):
+        if self._waits_too_long("odometry", reader.waits_for_odometry, now_s, ODOMETRY_PATIENCE_S):
             yield from self._recorded(reader.skip_odometry())
 
     def finish(self) -> Iterator[SensorRecord]:
         """Yield all that waits, as no more messages come."""
         if self._reader is not None:
             yield from self._recorded(self._reader.finish())
+
+    def _waits_too_long(self, what: str, is_waiting: bool, now_s: float, longest_s: float) -> bool:
+        """Whether the wait for something goes on for too long; then it begins again."""
+        since_s = self._waiting_since_s.setdefault(what, now_s) if is_waiting else now_s
+        is_over = now_s > since_s + longest_s
+        if is_over or not is_waiting:
+            self._waiting_since_s.pop(what, None)
+        return is_over
 
     def _new_reader(self, plan: LivePlan) -> SensorReader | CloudStream:
         if plan.clouds is not None:
@@ -209,7 +197,7 @@ class LiveSensors:
 
     def _recorded(self, entries: Iterator[Numbered] | Iterator[tuple[int, CloudScan]]) -> Iterator[SensorRecord]:
         for number, entry in entries:
-            self._odometry_patience.forget()
+            self._waiting_since_s.pop("odometry", None)
             plan = self._plan
             assert plan is not None  # nothing is read before
             if isinstance(entry, CloudScan):

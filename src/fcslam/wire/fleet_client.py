@@ -1,4 +1,4 @@
-"""HTTP clients of a robot that follows its fleet (the joint map in tiles, all robots), or reads the maps of a cloud."""
+"""HTTP client of a robot that follows its fleet (the joint map in tiles, all robots), or reads the maps of a cloud."""
 
 import json
 from urllib.parse import quote
@@ -13,7 +13,7 @@ _MAPS = TypeAdapter(tuple[ServedMap, ...])
 
 
 class FleetClient(HttpClient):
-    """Follows the fleet of one robot. Each method raises as ``HttpTransport.state``."""
+    """Follows the fleet of one robot, or reads the maps. Each method raises as ``HttpTransport.state``."""
 
     def exchange(self, robot: str, map_index: int | None, pose: tuple[float, ...] | None) -> FleetReply:
         """Say where the robot is in its map, if it knows, and read where all robots are."""
@@ -53,12 +53,8 @@ class FleetClient(HttpClient):
             return None
         return response.content, response.headers.get("ETag", "")
 
-
-class MapClient(HttpClient):
-    """Reads the maps of one cloud; it needs the rights of a viewer. Each method raises as ``HttpTransport.state``."""
-
     def maps(self) -> list[ServedMap]:
-        """The maps of the cloud now."""
+        """The maps of the cloud now, for a token with the rights of a viewer."""
         response = self._ask("GET", "maps")
         with self._reading():
             return list(_MAPS.validate_json(response.content))
