@@ -112,6 +112,12 @@ def test_vetoes_stay_in_force(logs, tmp_path):
     assert not any(c.status is fcslam.ClosureStatus.ACCEPTED for c in between)
 
 
+def test_the_settings_of_the_cloud_are_kept(logs, tmp_path):
+    fcslam.map_recordings(logs[:2], output=tmp_path / "alone", config={"fleet": {"join_maps": False}})
+    run = fcslam.map_recordings([], onto=tmp_path / "alone")
+    assert len({trajectory.map_index for trajectory in run.trajectories.values()}) == 2
+
+
 def test_a_mission_file_survives_the_run_folder(begun, tmp_path):
     open_run(begun).save(tmp_path / "copy")
     assert (tmp_path / "copy" / "mission.fcslam").read_bytes() == (begun / "mission.fcslam").read_bytes()

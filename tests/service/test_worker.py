@@ -34,6 +34,7 @@ from fcslam.service.worker import (
     MOST_CRASHES,
     QUALITY_EVERY_S,
     SNAPSHOT_EVERY_S,
+    CrashLog,
     Worker,
 )
 from fcslam.sources import open_source
@@ -676,3 +677,12 @@ def test_refusals_are_stored_together_and_outlive_the_worker(cloud):
     cloud.work()
     assert cloud.store.refused("c").count == 2 * AT_ONCE
     assert len(cloud.store.refusals("c")) == 100, "the last ones, however many there are"
+
+
+def test_a_task_that_a_worker_survived_is_no_longer_suspect(tmp_path):
+    for _ in range(MOST_CRASHES - 1):
+        CrashLog(tmp_path / "task").begin("packet 1 of a")
+    log = CrashLog(tmp_path / "task")
+    for task in ("packet 1 of a", "packet 2 of a", "packet 1 of a"):  # an edit lets packets be applied again
+        log.begin(task)
+    assert not CrashLog(tmp_path / "task").is_fatal("packet 1 of a")
