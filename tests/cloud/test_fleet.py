@@ -266,13 +266,6 @@ def test_maps_of_several_robots_join_whoever_came_first(scripted, names):
     assert np.array_equal(result.robots[0].T_map_base[0], np.zeros(3)), "in the frame of the robot that began first"
 
 
-def test_no_fusing_means_no_comparing(scripted):
-    cloud = scripted(closures(A, B, TRUE), join_maps=False)
-    result = feed(cloud, two_robots()).finalize()
-    assert map_of(result) == {"a": 0, "b": 1}
-    assert not result.closures
-
-
 def test_a_single_closure_joins_where_the_configuration_asks_for_no_more(scripted):
     cloud = scripted(closures(A, B, TRUE[2:3]), consistency={"minimum_closures": 1, "minimum_evidence": 1})
     result = feed(cloud, two_robots()).finalize()

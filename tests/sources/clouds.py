@@ -1,19 +1,23 @@
-"""Point clouds and depth images of a room, as drivers publish them; the ranges come from a small ray caster."""
+"""Point clouds and depth images of a room, as drivers publish them; the ranges come from a ray caster of the tests."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from tests import spinning_lidar
 from tests.sources.bag_messages import ROS1, ROS2, Said
 
 CLOUD, IMAGE, INFO = (f"sensor_msgs/msg/{name}" for name in ("PointCloud2", "Image", "CameraInfo"))
 ROOM = np.array([[-3.0, -2.0, 0.0], [5.0, 4.0, 2.5]])
 """Lowest and highest corner."""
-BOXES = (
-    np.array([[2.0, -1.5, 0.0], [2.5, -0.5, 0.5]]),  # a crate
-    np.array([[-2.5, 1.0, 0.7], [-1.0, 2.5, 0.74]]),  # a table top, above the band
-    np.array([[-1.0, -1.8, 0.0], [-0.8, -1.6, 0.05]]),  # a sill, below the band
+BOXES = np.array(
+    [
+        [[2.0, -1.5, 0.0], [2.5, -0.5, 0.5]],  # a crate
+        [[-2.5, 1.0, 0.7], [-1.0, 2.5, 0.74]],  # a table top, above the band
+        [[-1.0, -1.8, 0.0], [-0.8, -1.6, 0.05]],  # a sill, below the band
+    ]
 )
 NUMBERS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -22,23 +26,14 @@ PERIOD_S = 0.1
 
 def rotation(roll=0.0, pitch=0.0, yaw=0.0):
     """A turn about x, then y, then z."""
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in (roll, pitch, yaw))
-    return (
-        np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-        @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-        @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    )
+    return Rotation.from_euler("xyz", (roll, pitch, yaw)).as_matrix()
 
 
-def cast(origins, directions, boxes=BOXES):
+def cast(origins, directions):
     """Ranges of rays from inside the room, shape (N,)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        ranges = np.maximum((ROOM[0] - origins) / directions, (ROOM[1] - origins) / directions).min(axis=1)
-        for low, high in boxes:
-            a, b = (low - origins) / directions, (high - origins) / directions
-            enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
-            ranges = np.where((enter < leave) & (enter > 0.0) & (enter < ranges), enter, ranges)
-    return ranges
+        walls = np.maximum((ROOM[0] - origins) / directions, (ROOM[1] - origins) / directions).min(axis=1)
+    return np.minimum(walls, spinning_lidar.cast(BOXES, origins, directions))
 
 
 def plan_ranges(x, y, angles):

@@ -12,15 +12,11 @@ from fcslam.records import CloudScan, LaserScan, Odometry
 from fcslam.sources import BagOptions, open_fleet
 from tests.sources.bag_messages import ROS2, Said, odom, quaternion, save, scan, tf
 from tests.sources.clouds import VELODYNE, Measured, cloud, header, rotation, said, spinning, xyz
+from tests.sources.test_bag_clouds import START, pose_at
 
-START, LIDAR = 1_700_000_000.0, (0.1, 0.05, 0.4)
+LIDAR = (0.1, 0.05, 0.4)
 IMU = "sensor_msgs/msg/Imu"
 IN_3D = BagOptions(in_3d=True)
-
-
-def pose_at(times):
-    turn = 0.8 * np.asarray(times)
-    return np.stack((0.5 * np.sin(turn), 1.5 - 0.5 * np.cos(turn), turn), axis=1)
 
 
 def imu(t, rate=(0.0, 0.0, 0.8)):
