@@ -69,7 +69,7 @@ class FirstMessages(Messages):
 
     def clocked(self, message: BagMessage) -> BagMessage:
         """The message by the clock of its topic, as it is known now."""
-        return message.by_clock(self._census[message.topic].clock.lag_ns)
+        return message.by_clock(self._census[message.topic].lag_ns)
 
     def frames(self, scan: BagMessage) -> tuple[str, str]:
         """The frame of the first scan of a topic, and of this one."""
@@ -100,7 +100,7 @@ class FirstMessages(Messages):
         return tuple(
             (
                 min(self.counts[topic], FEWEST_FLOORS),
-                its.count > its.clock.unstamped,
+                its.count > its.unstamped,
                 sum(map(len, its.links.values())),
             )
             for topic, its in self._census.items()
@@ -183,7 +183,7 @@ class LivePlanner:
         census, counts, enough = self.messages.census, self.messages.counts, True
         for topic in self._topics.scans:
             its, info = census[topic], self.messages.by_name.get(info_beside(topic.name))
-            is_stamped = its.count > its.clock.unstamped
+            is_stamped = its.count > its.unstamped
             needed = FEWEST_FLOORS if topic.type in CLOUDS else SCANS_FOR_RIG
             enough &= counts[topic] >= (1 if is_late else needed) and (is_late or is_stamped)
             if topic.type == IMAGE and info is not None and not counts[info]:

@@ -71,7 +71,7 @@ class LiveSensors:
         if isinstance(message.decoded, ValueError):
             self._count_broken(message, message.decoded)
             return
-        if (is_scan or topic == self._topics.odometry) and messages.census[message.topic].clock.unstamped:
+        if (is_scan or topic == self._topics.odometry) and messages.census[message.topic].unstamped:
             self._notify(f"{topic} has messages without a stamp; the times at which they arrive count")
         if is_scan and self._is_of_other_frame(message):
             return
@@ -153,7 +153,7 @@ class LiveSensors:
             self._first_fixes.append(message)
             if self._fixes is None and len(self._first_fixes) >= FEWEST_LAGS:  # these show their clock
                 name, first = message.topic.name, self.planner.messages
-                lags_s = first.census[message.topic].clock.lags_s
+                lags_s = first.census[message.topic].lags_s
                 ahead_s, note = clock_ahead(first, plan.sensors.lasers[0], name, lags_s)
                 if note:
                     self._notify(note)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
+from statistics import median
 from tempfile import TemporaryFile, gettempdir
 from typing import Any, Final, NamedTuple, TypeVar
 from weakref import finalize
@@ -24,7 +25,6 @@ from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
 from fcslam.records import Beams, Sweep, Transform
-from fcslam.sources.bags.clocks import StampClock, restamped
 from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -32,6 +32,7 @@ from fcslam.sources.bags.codec import (
     IMAGE,
     IMU,
     LASER_SCANS,
+    NANOSECONDS,
     ODOMETRY,
     SCANS,
     TRANSFORM_KINDS,
@@ -46,6 +47,7 @@ from fcslam.sources.bags.messages import (
     header_of,
     odometry_of,
     scan_of,
+    stamp_ns_of,
     transforms_of,
 )
 from fcslam.sources.bags.records import MessagePlace, StoredMessage
@@ -82,12 +84,24 @@ class TopicCensus:
     """Transforms of tf from a parent to a child: the first, and the first ones that differ from it in each way."""
     odom_frames: set[str] = field(default_factory=set)
     """Parent frames of odometry."""
-    clock: StampClock = field(default_factory=StampClock)
+    unstamped: int = 0
+    """Messages with a stamp of zero."""
     broken: int = 0
     """Messages that are invalid."""
     first_broken: int = 0
     """Number of the first of them, from 1."""
     error: str = ""
+    _lags_s: list[float] = field(default_factory=list)
+
+    @property
+    def lags_s(self) -> list[float]:
+        """Times from the stamps of the first messages to their recording, which count if none has a stamp."""
+        return self._lags_s or [0.0] * min(self.unstamped, FIRST_MESSAGES)
+
+    @property
+    def lag_ns(self) -> int:
+        """Time of recording less the clock of the stamps that are set, in whole milliseconds; 0 if none is missing."""
+        return round(1e3 * median(self._lags_s)) * 10**6 if self.unstamped and self._lags_s else 0
 
     def add(self, time_ns: int) -> None:
         """Count a message."""
@@ -105,10 +119,19 @@ class TopicCensus:
             content = _decode(message.payload, message.kind, ros1)
             stamped = content.transforms if message.kind in TRANSFORM_KINDS else (content,)
             for each in stamped:
-                self.clock.note(each.header, message.time_ns)
+                stamp_ns = stamp_ns_of(each.header)
+                self.unstamped += not stamp_ns
+                if stamp_ns and len(self._lags_s) < FIRST_MESSAGES:
+                    self._lags_s.append((message.time_ns - stamp_ns) / NANOSECONDS)
             if message.kind in SCANS:
                 self.frames[header_of(content.header, message.time_ns)[1]] += 1
-            found = _converted(message.kind, content, message.time_ns)
+            found = content
+            if message.kind in LASER_SCANS:
+                found = scan_of(content, message.time_ns)
+            elif message.kind == ODOMETRY:
+                found = odometry_of(content, message.time_ns)
+            elif message.kind in TRANSFORM_KINDS:
+                found = list(transforms_of(content, message.time_ns))
         except ValueError as error:
             if not self.broken:
                 self.first_broken, self.error = self.count, str(error)
@@ -148,7 +171,7 @@ class BagMessage(NamedTuple):
         if not lag_ns:
             return self
         is_converted = self.topic.type in _KEPT
-        decoded = restamped(self.decoded, self.bag_time_ns, lag_ns) if is_converted else self.decoded
+        decoded = _restamped(self.decoded, self.bag_time_ns, lag_ns) if is_converted else self.decoded
         return self._replace(unstamped_ns=self.bag_time_ns - lag_ns, decoded=decoded)
 
 
@@ -226,7 +249,7 @@ class DecodedBag(Messages):
         """As in ``Messages``."""
         parts, census, rows, tape = self._index
         by_number = {census[topic].number: topic for topic in topics}
-        lags_ns = {number: census[topic].clock.lag_ns for number, topic in by_number.items()}
+        lags_ns = {number: census[topic].lag_ns for number, topic in by_number.items()}
         counts: Counter[Topic] = Counter()
         with ExitStack() as opened:
             payloads: dict[int, Callable[[MessagePlace], bytes]] = {}
@@ -319,15 +342,6 @@ def _messages(part: BagPart) -> Iterator[StoredMessage]:
             yield message
 
 
-def _converted(kind: str, content: Any, now_ns: int) -> Any:
-    """The content of a message of a type that is kept; of another, the object of rosbags."""
-    if kind in LASER_SCANS:
-        return scan_of(content, now_ns)
-    if kind == ODOMETRY:
-        return odometry_of(content, now_ns)
-    return list(transforms_of(content, now_ns)) if kind in TRANSFORM_KINDS else content
-
-
 def _decode(payload: bytes, kind: str, ros1: bool) -> Any:
     if not ros1 and payload.startswith(ZSTD):
         try:
@@ -335,6 +349,15 @@ def _decode(payload: bytes, kind: str, ros1: bool) -> Any:
         except LimitError as error:
             raise ValueError(str(error)) from error
     return MessageCodec(ros1).decode(payload, kind)
+
+
+def _restamped(content: Any, now_ns: int, lag_ns: int) -> Any:
+    """The content of a message by the clock of its topic: a stamp that is the time of recording was zero."""
+    if isinstance(content, list):
+        return [_restamped(each, now_ns, lag_ns) for each in content]
+    if isinstance(content, ValueError) or content.stamp != now_ns / NANOSECONDS:
+        return content
+    return content._replace(stamp=(now_ns - lag_ns) / NANOSECONDS)
 
 
 def _packed(content: Content) -> bytes:

@@ -178,7 +178,7 @@ def clock_ahead(bag: Messages, laser: RecordedLaser, name: str, lags_s: Sequence
     they end, and a line that says it. It is 0 if they differ by little, if one varies, or if there are few messages.
     """
     usual_s = []
-    for each_s in ([lag_s - laser.first.duration_s for lag_s in bag.census[laser.topic].clock.lags_s], lags_s):
+    for each_s in ([lag_s - laser.first.duration_s for lag_s in bag.census[laser.topic].lags_s], lags_s):
         low_s, middle_s, high_s = quantiles(each_s, n=4) if len(each_s) >= FEWEST_LAGS else (0.0, 0.0, inf)
         if high_s - low_s > MAX_STEP_BACK_S:
             return 0.0, ""
@@ -216,7 +216,7 @@ class _Planner:
         needs_imu = odometry is None or self._scans.is_whole(lasers[0].topic)
         fixes, imu = next(iter(self._robot.of_type(FIX)), None), next(iter(self._robot.of_type(IMU)), None)
         imu = imu if needs_imu else None
-        lags_s = {each.name: bag.census[each].clock.lags_s for each in (fixes, imu) if each is not None}
+        lags_s = {each.name: bag.census[each].lags_s for each in (fixes, imu) if each is not None}
         if odometry is not None:
             lags_s = {odometry.name: self._lags_s(odometry), **lags_s}
         clocks = {name: clock_ahead(bag, lasers[0], name, each_s) for name, each_s in lags_s.items()}

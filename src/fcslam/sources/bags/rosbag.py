@@ -206,10 +206,10 @@ class RosBag:
         notes = [
             *self.bag.notes,
             *(
-                f"{self.path}: {its.clock.unstamped} of {its.count} messages of {topic.name} have no stamp; their "
+                f"{self.path}: {its.unstamped} of {its.count} messages of {topic.name} have no stamp; their "
                 "times of recording count"
                 for topic, its in self.bag.census.items()
-                if topic in plan.read_topics(with_images=False) and not is_transforms(topic) and its.clock.unstamped > 1
+                if topic in plan.read_topics(with_images=False) and not is_transforms(topic) and its.unstamped > 1
             ),
             *chain.from_iterable(laser.notes(self.path, self.options.cloud_band) for laser in lasers),
             *plan.scans.notes,
