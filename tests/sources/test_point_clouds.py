@@ -288,7 +288,7 @@ def test_an_invalid_cloud_is_refused_by_its_field(changes, said):
     ("attribute", "value", "said"),
     [
         ("encoding", "rgb8", "'rgb8' is not that of a depth image"),
-        ("width", 2**31, "do not describe a depth image"),
+        ("width", 2**31, "do not describe an image"),
         ("step", 1, "step 1"),
         ("height", 7, "do not fill"),
     ],

@@ -8,14 +8,16 @@ the floor below the LiDAR.
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import cached_property
+from io import StringIO
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.errors import SourceError
 from fcslam.records import CloudScan
-from fcslam.sources.bags.clouds import MOST_POINTS, TIMES, timed
+from fcslam.sources.bags.clouds import MOST_POINTS, TIMES, measured_cloud
 from fcslam.sources.bags.messages import LONGEST_SWEEP_S
 from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, CloudRecording, reader_of
 from fcslam.sources.faults import Audit, Fault
@@ -110,47 +112,34 @@ def read_cloud(path: Path, stamp: float) -> PointCloud:
         content = read_bytes(path, most=_MOST_BYTES)
     try:
         values = {".bin": _kitti, ".pcd": _pcd, ".ply": _ply}[path.suffix](content)
-        points = np.stack([np.asarray(values[axis], np.float64) for axis in "xyz"], axis=1)
+        points = np.stack([values[axis].astype(np.float64) for axis in "xyz"], axis=1)
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise SourceError(f"{path}: is not a cloud that can be read ({error}); write it again") from error
-    measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
-    cloud = PointCloud(stamp, "", points[measured], np.empty(0))
-    name = next((name for name in TIMES if name in values), None)
-    return cloud if name is None else timed(cloud, np.asarray(values[name])[measured], LONGEST_SWEEP_S)
+    times = next((values[name] for name in TIMES if name in (values.dtype.names or ())), None)
+    return measured_cloud(stamp, "", points, times, LONGEST_SWEEP_S)
 
 
-def _kitti(content: bytes) -> dict[str, Any]:
-    values = np.frombuffer(content, "<f4").reshape(-1, 4)  # the last one is the intensity
-    return {"x": values[:, 0], "y": values[:, 1], "z": values[:, 2]}
+def _kitti(content: bytes) -> NDArray[Any]:
+    return np.frombuffer(content, [(name, "<f4") for name in ("x", "y", "z", "intensity")])
 
 
-def _pcd(content: bytes) -> dict[str, Any]:
+def _pcd(content: bytes) -> NDArray[Any]:
     header: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in header:
         end = content.index(b"\n", at)
         key, *words = content[at:end].decode("ascii", "replace").split() or ["#"]
         header[key], at = words, end + 1
-    names, count = header["FIELDS"], int(header["POINTS"][0])
+    names = [name if name != "_" else f"_{k}" for k, name in enumerate(header["FIELDS"])]
     kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
-    counts = [int(each) for each in header.get("COUNT", ["1"] * len(names))]
-    layout = np.dtype(
-        [
-            (f"{name}" if name != "_" else f"_{k}", kind, (many,) if many > 1 else ())
-            for k, (name, kind, many) in enumerate(zip(names, kinds, counts, strict=True))
-        ]
-    )
-    if header["DATA"] == ["ascii"]:
-        if max(counts) > 1:
-            raise ValueError("fields of several values in text")
-        return _columns(content[at:], names, count)
-    if header["DATA"] != ["binary"]:
+    counts = map(int, header.get("COUNT", ["1"] * len(names)))
+    if header["DATA"] not in (["ascii"], ["binary"]):
         raise ValueError(f"DATA {' '.join(header['DATA'])}: convert it to binary with pcl_convert_pcd_ascii_binary")
-    rows = np.frombuffer(content, layout, count, at)
-    return {name: rows[name] for name in rows.dtype.names or ()}
+    fields = list(zip(names, kinds, counts, strict=True))
+    return _rows(content[at:], fields, int(header["POINTS"][0]), header["DATA"] == ["ascii"])
 
 
-def _ply(content: bytes) -> dict[str, Any]:
+def _ply(content: bytes) -> NDArray[Any]:
     end = content.index(b"end_header")
     lines = [line.split() for line in content[:end].decode("ascii", "replace").splitlines()]
     begin = content.index(b"\n", end) + 1
@@ -159,19 +148,21 @@ def _ply(content: bytes) -> dict[str, Any]:
         raise ValueError("its first element is not `vertex`")
     after = lines.index(elements[0]) + 1
     until = lines.index(elements[1]) if len(elements) > 1 else len(lines)
-    properties = [words for words in lines[after:until] if words[:1] == ["property"]]
-    names, count = [words[-1] for words in properties], int(elements[0][2])
     order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[lines[1][1]]
-    if not order:
-        return _columns(content[begin:], names, count)
-    layout = np.dtype([(name, order + _PLY_TYPES[words[1]]) for name, words in zip(names, properties, strict=True)])
-    rows = np.frombuffer(content, layout, count, begin)
-    return {name: rows[name] for name in names}
+    properties = [words for words in lines[after:until] if words[:1] == ["property"]]
+    fields = [(words[-1], order + _PLY_TYPES[words[1]], 1) for words in properties]
+    return _rows(content[begin:], fields, int(elements[0][2]), not order)
 
 
-def _columns(text: bytes, names: list[str], count: int) -> dict[str, Any]:
-    values = np.array(text.split()[: count * len(names)], np.float64).reshape(count, len(names))
-    return dict(zip(names, values.T, strict=True))
+def _rows(content: bytes, fields: list[tuple[str, str, int]], count: int, is_text: bool) -> NDArray[Any]:
+    """The points, by the names of the fields, with their types and numbers of values."""
+    layout = [(name, "f8" if is_text else kind, (many,) if many > 1 else ()) for name, kind, many in fields]
+    if not is_text:
+        return np.frombuffer(content, layout, count)
+    lines = content.decode("ascii").splitlines()[:count]
+    if not 0 < count == len(lines):
+        raise ValueError(f"{len(lines)} lines for {count} points")
+    return np.loadtxt(StringIO("\n".join(lines)), layout, ndmin=1)
 
 
 def _seconds(text: str, file: Path) -> float:

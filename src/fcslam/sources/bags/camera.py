@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.records import CameraModel
 from fcslam.sources.bags.codec import COMPRESSED_IMAGE
@@ -52,19 +53,25 @@ def image_of(content: Any, kind: str, bag_time_ns: int) -> ImageMessage:
 def _encoded_png(content: Any) -> bytes:
     import cv2
 
-    channels, width, height, step = _CHANNELS.get(content.encoding), content.width, content.height, content.step
+    channels = _CHANNELS.get(content.encoding)
     if channels is None:
         raise ValueError("an encoding that is not read")
-    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and step >= width * channels):
-        raise ValueError("invalid width or height")
-    data = np.asarray(content.data, dtype=np.uint8)
-    if len(data) != step * height:
-        raise ValueError("the pixels do not fill the image")
-    pixels = data.reshape(height, step)[:, : width * channels].reshape(height, width, channels)
+    pixels = pixel_rows(content, channels).reshape(content.height, content.width, channels)
     if content.encoding == "rgb8":
         pixels = pixels[..., ::-1]
     _, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, _FASTEST])
     return bytes(encoded)
+
+
+def pixel_rows(content: Any, pixel_bytes: int) -> NDArray[np.uint8]:
+    """The bytes of the rows of an image, shape (height, width * pixel_bytes)."""
+    width, height, step = content.width, content.height, content.step
+    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and step >= width * pixel_bytes):
+        raise ValueError(f"width {width}, height {height} and step {step} do not describe an image")
+    data = np.asarray(content.data, dtype=np.uint8)
+    if len(data) != step * height:
+        raise ValueError("the pixels do not fill the image")
+    return np.ascontiguousarray(data.reshape(height, step)[:, : width * pixel_bytes])
 
 
 def calibration_of(content: Any) -> Calibration:

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 
 from fcslam.records import FloatArray, Transform
-from fcslam.sources.bags.camera import MAX_SIDE_PX, Calibration
+from fcslam.sources.bags.camera import Calibration, pixel_rows
 from fcslam.sources.bags.codec import IMAGE, POINT_CLOUD
 from fcslam.sources.bags.messages import LONGEST_SWEEP_S, header_of
 from fcslam.sources.bags.options import GivenPose
@@ -74,15 +74,17 @@ def cloud_of(
     if kind == IMAGE:
         return PointCloud(stamp, frame, _depth_points(content, calibration), np.empty(0))
     if kind == POINT_CLOUD:
-        points, times = _fields(content)
-    else:
-        points = np.array([(each.x, each.y, each.z) for each in content.points], np.float64).reshape(-1, 3)
-        times = np.array([each.offset_time for each in content.points], np.int64)
+        return measured_cloud(stamp, frame, *_fields(content), longest_s)
+    points = np.array([(each.x, each.y, each.z) for each in content.points], np.float64).reshape(-1, 3)
+    times = np.array([each.offset_time for each in content.points], np.int64)
+    return measured_cloud(stamp, frame, points, times, longest_s)
+
+
+def measured_cloud(stamp: float, frame: str, points: FloatArray, times: Any, longest_s: float) -> PointCloud:
+    """The cloud of the points that are returns, with their times as they are sent; None: there are none."""
     measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
-    points = points[measured]
-    if times is None:
-        return PointCloud(stamp, frame, points, np.empty(0))
-    return timed(PointCloud(stamp, frame, points, np.empty(0)), times[measured], longest_s)
+    cloud = PointCloud(stamp, frame, points[measured], np.empty(0))
+    return cloud if times is None else _timed(cloud, times[measured], longest_s)
 
 
 def _fields(content: Any) -> tuple[FloatArray, Any]:
@@ -152,7 +154,7 @@ def notes_on_times(topic: str, kind: str, clouds: Sequence[PointCloud]) -> Itera
         )
 
 
-def timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
+def _timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
     """The cloud with the times of its points, of any usual unit and beginning; points with wrong times are left out.
 
     Times that are none in any unit, as shares of a turn, give only the order of the points.
@@ -188,19 +190,13 @@ def timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
 
 
 def _depth_points(content: Any, calibration: Calibration | None) -> FloatArray:
-    width, height, step = content.width, content.height, content.step
     if content.encoding not in _DEPTHS:
         raise ValueError(f"the encoding '{content.encoding}' is not that of a depth image, 16UC1 or 32FC1")
     if calibration is None:
         raise ValueError("no calibration (camera_info) of the depth image")
     kind, unit_m = _DEPTHS[content.encoding]
     pixel = np.dtype((">" if content.is_bigendian else "<") + kind)
-    if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and step >= width * pixel.itemsize):
-        raise ValueError(f"width {width}, height {height} and step {step} do not describe a depth image")
-    if len(content.data) != step * height:
-        raise ValueError("the pixels do not fill the image")
-    rows = np.frombuffer(content.data, np.uint8).reshape(height, step)[:, : width * pixel.itemsize]
-    depth_m = np.ascontiguousarray(rows).view(pixel).astype(np.float64) * unit_m
+    depth_m = pixel_rows(content, pixel.itemsize).view(pixel).astype(np.float64) * unit_m
     camera = calibration.camera
-    across, down = width / camera.width, height / camera.height  # of images that were made smaller
+    across, down = content.width / camera.width, content.height / camera.height  # of images that were made smaller
     return depth_points(depth_m, camera.fx * across, camera.fy * down, camera.cx * across, camera.cy * down)
