@@ -95,7 +95,7 @@ class CloudReader:
         """The record of a cloud with the readings since the previous one; raises ValueError if it has few points."""
         if len(cloud.points) < _FEWEST_POINTS:
             raise ValueError(f"{len(cloud.points)} points are not a turn of a 3D LiDAR")
-        points = cloud.points @ self.mounting.rotation.T + self.mounting.position_m
+        points = self.mounting.in_base(cloud)
         times: NDArray[np.float64] = np.zeros(len(points))
         if self.is_timed and len(cloud.times_s):
             times = cloud.times_s
@@ -156,9 +156,9 @@ def reader_of(
         notes.append(
             f"{where}: many points are below the floor, so the LiDAR is upside down; corrected: correct it in tf"
         )
-    elif (on_floor < _FLOOR_SHARE and not any(floor_in(points, mounting) for points in _in_base(first, mounting))) or (
+    elif (on_floor < _FLOOR_SHARE and not any(floor_in(mounting.in_base(cloud), mounting) for cloud in first)) or (
         below > _BELOW_SHARE
-        and sum(floor_at(points, FLOOR_REACH_M) is not None for points in _in_base(first, mounting))
+        and sum(floor_at(mounting.in_base(cloud), FLOOR_REACH_M) is not None for cloud in first)
         <= _FEW_FLOORS * len(first)
     ):
         notes.append(
@@ -195,13 +195,9 @@ def _elevations(cloud: PointCloud) -> float:
     return float(high - low)
 
 
-def _in_base(first: Sequence[PointCloud], mounting: CloudMounting) -> list[FloatArray]:
-    return [cloud.points @ mounting.rotation.T + mounting.position_m for cloud in first]
-
-
 def _on_floor(first: Sequence[PointCloud], mounting: CloudMounting) -> CloudMounting | None:
     """The mounting with the height above the floor that most clouds show; None if most show no floor."""
-    floors = [floor_in(points, mounting) for points in _in_base(first, mounting)]
+    floors = [floor_in(mounting.in_base(cloud), mounting) for cloud in first]
     heights_m = [float(normal @ mounting.position_m) - distance_m for normal, distance_m in filter(None, floors)]
     if 2 * len(heights_m) < len(first):
         return None
@@ -211,5 +207,5 @@ def _on_floor(first: Sequence[PointCloud], mounting: CloudMounting) -> CloudMoun
 
 def _shares(first: Sequence[PointCloud], mounting: CloudMounting) -> tuple[float, float]:
     """Shares of the points on the floor, and below it."""
-    points = np.concatenate(_in_base(first, mounting))
+    points = np.concatenate([mounting.in_base(cloud) for cloud in first])
     return float(np.mean(np.abs(points[:, 2]) < _FLOOR_M)), float(np.mean(points[:, 2] < -_FLOOR_M))

@@ -111,6 +111,10 @@ class CloudMounting(NamedTuple):
     is_height_known: bool = True
     directions: int = DIRECTIONS
 
+    def in_base(self, cloud: PointCloud) -> FloatArray:
+        """The points of a cloud in ``base``, shape (N, 3)."""
+        return cloud.points @ self.rotation.T + self.position_m
+
 
 def scan_of_cloud(
     cloud: PointCloud, mounting: CloudMounting, band: CloudBand, motion: Sweep | None = None
@@ -120,7 +124,7 @@ def scan_of_cloud(
     If ``motion`` says how ``base`` moves around the stamp of the scan, for a cloud whose directions are in no order,
     each point is moved to where it is seen at the stamp.
     """
-    in_base = cloud.points @ mounting.rotation.T + mounting.position_m
+    in_base = mounting.in_base(cloud)
     offset_s = float(cloud.times_s.mean()) if len(cloud.times_s) else 0.0
     if motion is not None:
         in_base = _moved(in_base, cloud.times_s - offset_s, motion)
@@ -198,15 +202,14 @@ def depth_points(depth_m: FloatArray, fx: float, fy: float, cx: float, cy: float
 
 def leaning(clouds: Iterable[PointCloud], mounting: CloudMounting) -> FloatArray | None:
     """The rotation of a wrong mounting that makes the floor level in most clouds, shape (3, 3); None if it is right."""
-    in_base = [cloud.points @ mounting.rotation.T + mounting.position_m for cloud in clouds]
-    floors = [floor_in(points, mounting, LARGEST_LEANING_RAD) for points in in_base]
+    floors = [floor_in(mounting.in_base(cloud), mounting, LARGEST_LEANING_RAD) for cloud in clouds]
     normals = np.array([floor[0] for floor in floors if floor is not None]).reshape(-1, 3)
-    if len(normals) < max(FEWEST_FLOORS, len(in_base) // 2):
+    if len(normals) < max(FEWEST_FLOORS, len(floors) // 2):
         return None
     middle = np.median(normals, axis=0)
     middle /= np.linalg.norm(middle)
     is_same = normals @ middle > cos(_SAME_FLOOR_RAD)
-    if middle[2] > cos(LEANING_RAD) or np.count_nonzero(is_same) < max(FEWEST_FLOORS, len(in_base) // 2):
+    if middle[2] > cos(LEANING_RAD) or np.count_nonzero(is_same) < max(FEWEST_FLOORS, len(floors) // 2):
         return None
     return _levelling(middle, 0.0)
 
