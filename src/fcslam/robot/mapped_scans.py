@@ -10,7 +10,7 @@ from fcslam.lidar.frontend import laser_index
 from fcslam.lidar.own_body import Polygon, Sectors, is_in_polygon, is_in_sectors
 from fcslam.lidar.scan import rays_of
 from fcslam.records import Beams, LaserModel, LaserScan, Sweep, frozen
-from fcslam.sources.contradictions import has_return
+from fcslam.sources.contradictions import count_returns
 from fcslam.wire.limits import MAXIMUM_LASER_RANGE_M
 from fcslam.wire.quantisation import rounded
 
@@ -49,7 +49,7 @@ class MappedScans:
             ranges_m = np.where(is_in_polygon(points, self._footprint), np.float32(0.0), ranges_m)
         sweep = _mapped_sweep(scan.sweep, scan.laser.beam_count, step)
         ranges_m = rounded(ranges_m, laser.max_range_m)
-        if not has_return(ranges_m, laser.max_range_m):
+        if not count_returns(ranges_m, laser.max_range_m):
             ranges_m = frozen(np.zeros_like(ranges_m), np.float32)
         return LaserScan(scan.stamp, ranges_m, laser, scan.T_odom_base, sweep, scan.on_teammates)
 

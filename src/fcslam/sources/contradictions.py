@@ -54,7 +54,7 @@ class ScanWatch:
         if not self._repeated.admits(scan):
             self._audit.add(Fault.REPEATED_SCAN, number)
             return
-        if not has_return(scan.ranges_m, scan.laser.max_range_m):
+        if not count_returns(scan.ranges_m, scan.laser.max_range_m):
             self._audit.add(Fault.NO_RETURN, number)
         if any(map(isnan, scan.T_odom_base.tolist())):
             return
@@ -68,13 +68,6 @@ class ScanWatch:
 def count_returns(ranges_m: Ranges, max_range_m: float) -> int:
     """Number of beams of a scan with a return below the maximum range."""
     return int(np.count_nonzero((ranges_m > 0.0) & (ranges_m < max_range_m)))
-
-
-def has_return(ranges_m: Ranges, max_range_m: float) -> bool:
-    """Whether any beam of a scan has a return; the middle one mostly shows it."""
-    middle = len(ranges_m) // 2
-    shown = 0.0 < (ranges_m[middle] if middle else 0.0) < max_range_m
-    return bool(shown) or count_returns(ranges_m, max_range_m) > 0
 
 
 def _repeats(before: LaserScan, after: LaserScan) -> bool:

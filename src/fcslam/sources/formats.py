@@ -2,17 +2,17 @@
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from fcslam.errors import SourceError
 from fcslam.records import LaserScan
 from fcslam.sources.bags.container import is_bag, parts_of
 from fcslam.sources.bags.options import BagOptions
+from fcslam.sources.contradictions import count_returns
 from fcslam.sources.logs.archive import head, robot_name, translate_errors
 from fcslam.sources.logs.carmen import is_carmen
 from fcslam.sources.logs.carmen_log import CarmenLog
@@ -50,11 +50,12 @@ def open_fleet(
 
 def whole_clouds(source: Source, options: BagOptions | None) -> Source:
     """A recording as it is, or with ``in_3d`` its clouds whole."""
-    if options is None or not options.in_3d:
+    bag = bag_of(source) if options is not None and options.in_3d else None
+    if bag is None:
         return source
     from fcslam.sources.bags.cloud_bag import in_3d
 
-    return in_3d(source)
+    return in_3d(bag)
 
 
 def planar_note(sources: Sequence[Source]) -> str:
@@ -80,7 +81,11 @@ def check_copies(sources: Sequence[Source]) -> None:
         return
     owners: dict[int, Source] = {}
     for source in sources:
-        own = set(_distinct_scans(source))
+        own = {  # scans with returns, by their stamps to a millisecond, as formats round them
+            hash((round(record.stamp, 3), record.ranges_m.tobytes()))
+            for record in source.records()
+            if isinstance(record, LaserScan) and count_returns(record.ranges_m, inf)
+        }
         for name, shared in Counter(owners[scan].name for scan in own & owners.keys()).items():
             if shared >= _SCANS_SHARED:
                 raise SourceError(
@@ -88,13 +93,6 @@ def check_copies(sources: Sequence[Source]) -> None:
                     "recording; give each scan once"
                 )
         owners.update(dict.fromkeys(own, source))
-
-
-def _distinct_scans(source: Source) -> Iterator[int]:
-    """Hashes of the scans with returns: stamp to a millisecond, as formats round it, and ranges."""
-    for record in source.records():
-        if isinstance(record, LaserScan) and ((record.ranges_m > 0.0) & (record.ranges_m < np.inf)).any():
-            yield hash((round(record.stamp, 3), record.ranges_m.tobytes()))
 
 
 def robot_in(path: Path) -> tuple[Path, str | None]:

@@ -62,11 +62,9 @@ class CloudBag(CloudRecording):
         yield from stream.finish()
 
 
-def in_3d(source: Source) -> Source:
+def in_3d(bag: RosBag) -> Source:
     """The same recording with its clouds read whole, if it has any; else as it is, for a robot with a 2D laser."""
-    if not isinstance(source, RosBag):
-        return source
-    wanted = set(map(slashed, source.options.scan_topics))
-    clouds = (topic for topic in source.robot.of_type(*CLOUDS) if not wanted or slashed(topic.name) in wanted)
+    wanted = set(map(slashed, bag.options.scan_topics))
+    clouds = (topic for topic in bag.robot.of_type(*CLOUDS) if not wanted or slashed(topic.name) in wanted)
     best = next(clouds, None)
-    return source if best is None else CloudBag(source, best)
+    return bag if best is None else CloudBag(bag, best)
