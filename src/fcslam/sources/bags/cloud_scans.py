@@ -20,7 +20,7 @@ from fcslam.sources.bags.messages import ScanMessage, header_of
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.robots import BagRobot
 from fcslam.sources.bags.topics import calibration_beside
-from fcslam.sources.bags.transforms import NoTransformError, TransformTree, is_fixed
+from fcslam.sources.bags.transforms import NoTransformError, TransformTree, is_corrected, is_odom
 from fcslam.sources.clouds_in_space import CloudReader, reader_of
 from fcslam.sources.gate import FIRST_MESSAGES
 from fcslam.sources.point_clouds import CloudMounting, PointCloud, directions_in, leaning, scan_of_cloud, unit_problem
@@ -111,7 +111,7 @@ class CloudScans:
         try:
             T_base_sensor = self._tree.fixed(self._base_frame_of(frame), frame)
         except NoTransformError as error:
-            if is_fixed(frame):
+            if is_odom(frame) or is_corrected(frame):
                 raise SourceError(
                     f"{self._robot.bag.label}the points of {topic.name} are in '{frame}', in which the robot drives, "
                     "so another node has moved them; record the clouds of the sensor's driver, or choose them by "

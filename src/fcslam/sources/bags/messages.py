@@ -78,7 +78,8 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
     range_max_m = min(range_max_m, UNKNOWN_RANGE_M) if range_max_m > 0.0 else UNKNOWN_RANGE_M
     if not range_max_m > range_min_m:
         raise ValueError(f"range_min {range_min_m:g} is not below range_max {range_max_m:g}")
-    sweep = _sweep(count, float(content.time_increment))
+    last_s = (count - 1) * float(content.time_increment)  # the stamp is the time of the first, as LaserScan.msg says
+    sweep = Sweep(0.0, last_s) if SHORTEST_SWEEP_S <= last_s <= LONGEST_SWEEP_S else None  # NaN is in no interval
     if increment_rad < 0.0:
         first_rad, increment_rad, ranges = first_rad + span_rad, -increment_rad, ranges[::-1]
         sweep = reversed_sweep(sweep)
@@ -87,12 +88,6 @@ def scan_of(content: Any, bag_time_ns: int) -> ScanMessage:
     stamp, frame = header_of(content.header, bag_time_ns)
     beams = Beams(count, first_rad, increment_rad)
     return ScanMessage(stamp, frame, beams, range_min_m, range_max_m, ranges, sweep=sweep)
-
-
-def _sweep(count: int, increment_s: float) -> Sweep | None:
-    """Times of the beams of a message: the stamp is the time of the first, as ``LaserScan.msg`` says."""
-    last_s = (count - 1) * increment_s
-    return Sweep(0.0, last_s) if SHORTEST_SWEEP_S <= last_s <= LONGEST_SWEEP_S else None  # NaN is in no interval
 
 
 def reversed_sweep(sweep: Sweep | None) -> Sweep | None:

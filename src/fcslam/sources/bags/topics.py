@@ -94,8 +94,9 @@ def choose_topics(
         raise SourceError(f"{known.label}{what}{known.place}; {remedy}; {_listed(known)}")
     lasers = [_named(known, name, "--sensors scan-topic") for name in dict.fromkeys(options.scan_topics)]
     if not lasers:
-        lasers = [_best_scan(_preferred(scans), field_of_view_rad)]
-    odometries = [*_measured(known), *known.transforms]
+        lasers = [_best_scan(scans, field_of_view_rad)]
+    odometries = [topic for topic in heard if topic.type == ODOMETRY and not is_truth(topic.name)]
+    odometries += known.transforms
     if options.odom_topic == NO_ODOMETRY:
         odometries = []
     elif options.odom_topic is not None:
@@ -125,16 +126,9 @@ def _scans(known: KnownTopics) -> list[Topic]:
     ]
 
 
-def _preferred(scans: Sequence[Topic]) -> list[Topic]:
-    kinds = ([topic for topic in scans if topic.type in types] for types in (LASER_SCANS, SCANS, (IMAGE,)))
-    return next(filter(None, kinds), [])
-
-
-def _measured(known: KnownTopics) -> list[Topic]:
-    return [topic for topic in known.heard if topic.type == ODOMETRY and not is_truth(topic.name)]
-
-
 def _best_scan(scans: Sequence[Topic], field_of_view_rad: Callable[[Topic], float]) -> Topic:
+    kinds = ([topic for topic in scans if topic.type in types] for types in (LASER_SCANS, SCANS, (IMAGE,)))
+    scans = next(filter(None, kinds))
     if len(scans) == 1:
         return scans[0]
     view_rad = {topic: field_of_view_rad(topic) for topic in scans}

@@ -199,11 +199,6 @@ def is_corrected(frame: str) -> bool:
     return any(name in last_part(frame) for name in _CORRECTED) and not is_odom(frame)
 
 
-def is_fixed(frame: str) -> bool:
-    """Whether a frame of this name usually stands on the floor."""
-    return is_odom(frame) or is_corrected(frame)
-
-
 def _matches(link: Link, parent: str | None, child: str | None) -> bool:
     return parent in (None, link[0]) and child in (None, link[1])
 

@@ -133,8 +133,10 @@ class _Bag:
         reading = (stamp_ns, *T_odom_base.tolist())
         if reading != self._latest_reading:
             odom = self._codec.header(stamp_ns, _ODOM)
-            self._put("/odom", ODOMETRY, self._odometry(odom, T_odom_base))
-            self._put("/tf", TRANSFORMS, self._codec.transforms(odom, _BASE, in_space(T_odom_base)))
+            make, transform = self._codec.make, in_space(T_odom_base)
+            posed = make("geometry_msgs/PoseWithCovariance", pose=self._codec.pose(transform))
+            self._put("/odom", ODOMETRY, make(ODOMETRY, header=odom, child_frame_id=_BASE, pose=posed))
+            self._put("/tf", TRANSFORMS, self._codec.transforms(odom, _BASE, transform))
             self._latest_reading = reading
 
     def _put_scan(self, stamp_ns: int, scan: LaserScan) -> None:
@@ -191,11 +193,6 @@ class _Bag:
         if topic not in self._connections:
             self._connections[topic] = self._connect(topic, kind)
         self._writer.write(self._connections[topic], self._bag_time_ns, self._codec.encode(message, kind))
-
-    def _odometry(self, header: Any, T_parent_base: FloatArray) -> Any:
-        make, pose = self._codec.make, self._codec.pose(in_space(T_parent_base))
-        posed = make("geometry_msgs/PoseWithCovariance", pose=pose)
-        return make(ODOMETRY, header=header, child_frame_id=_BASE, pose=posed)
 
     def _scan(self, header: Any, scan: LaserScan) -> Any:
         count, first_rad, increment_rad = scan.laser.beams

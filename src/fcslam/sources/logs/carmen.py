@@ -19,7 +19,7 @@ import re
 from array import array
 from collections.abc import Sequence
 from itertools import pairwise
-from math import isfinite, nan
+from math import inf, isfinite, nan
 from pathlib import Path
 
 import numpy as np
@@ -195,8 +195,16 @@ def _measured(front: bytes) -> tuple[FloatArray, LaserModel]:
     remission_count, *remissions = rest.split()
     if len(remissions) != int(remission_count):
         raise ValueError("number of remissions differs from the stated one")
-    numbers = [float(token) for token in (start, fov, resolution, max_range)]
-    return values, _stated_laser(int(kind), numbers, len(values))
+    start_rad, fov_rad, increment_rad, max_range_m = map(float, (start, fov, resolution, max_range))
+    if not increment_rad > 0.0:
+        increment_rad = fov_rad / (len(values) - 1)
+    if not (increment_rad > 0.0 and is_field_of_view(Beams(len(values), start_rad, increment_rad))):
+        raise ValueError("invalid field of view")
+    if not 0.0 < max_range_m < inf:
+        max_range_m = SICK_MAX_RANGE_M
+    if int(kind) in SICK_TYPES:
+        max_range_m = min(max_range_m, SICK_MAX_RANGE_M)
+    return values, LaserModel(len(values), start_rad, increment_rad, max_range_m)
 
 
 def numbers_in(text: bytes, count: int) -> tuple[FloatArray, bytes]:
@@ -235,18 +243,6 @@ def _plain_numbers(text, values):  # type: ignore[no-untyped-def]
             return -1
         values[k] = number / _POWERS[decimals]
     return at
-
-
-def _stated_laser(kind: int, numbers: list[float], beam_count: int) -> LaserModel:
-    start_rad, fov_rad, resolution_rad, max_range_m = numbers
-    increment_rad = resolution_rad if resolution_rad > 0.0 else fov_rad / (beam_count - 1)
-    if not (increment_rad > 0.0 and is_field_of_view(Beams(beam_count, start_rad, increment_rad))):
-        raise ValueError("invalid field of view")
-    if not 0.0 < max_range_m < float("inf"):
-        max_range_m = SICK_MAX_RANGE_M
-    if kind in SICK_TYPES:
-        max_range_m = min(max_range_m, SICK_MAX_RANGE_M)
-    return LaserModel(beam_count, start_rad, increment_rad, max_range_m)
 
 
 def _pose_of(tokens: Sequence[bytes | float]) -> Pose:

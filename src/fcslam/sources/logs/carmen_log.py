@@ -24,9 +24,6 @@ from fcslam.sources.pose import UNKNOWN_POSE, pose_of
 from fcslam.sources.returns import RangeSample, placeholder_note, without
 from fcslam.sources.source import Survey
 
-_Entry = tuple[int, FloatArray]
-"""A scan or a reading of the odometry, counted as in ``CarmenArrays.contents``, and T_odom_base."""
-
 
 class _Reading(NamedTuple):
     survey: Survey
@@ -58,7 +55,7 @@ class CarmenLog:
         audit = self._audit = Audit()
         watch, log, reading = ScanWatch(audit), self._log, self._reading
         (laser,) = reading.survey.lasers
-        for number, (k, T_odom_base) in self._posed(audit):
+        for number, k, T_odom_base in self._posed(audit):
             if k < 0:
                 if reading.has_odometry:
                     yield Odometry(log.odometry_stamps[~k], T_odom_base)
@@ -127,8 +124,8 @@ class CarmenLog:
         )
         return _Reading(survey, pose_from_odometry, driven.fault is None, placeholders)
 
-    def _posed(self, audit: Audit) -> Iterator[tuple[int, _Entry]]:
-        """Lines with consistent scans, and with the readings of the odometry among them."""
+    def _posed(self, audit: Audit) -> Iterator[tuple[int, int, FloatArray]]:
+        """Lines of consistent scans and odometry, what they hold as in ``CarmenArrays.contents``, and T_odom_base."""
         log, reading = self._log, self._reading
         unknown: FloatArray = frozen(UNKNOWN_POSE)
         latest: FloatArray | None = None
@@ -140,7 +137,7 @@ class CarmenLog:
                 pose = unknown
             elif latest is not None:
                 pose = latest
-            yield number, (k, pose)
+            yield number, k, pose
 
     def _consistent(self, declared: Beams, audit: Audit) -> Iterator[tuple[int, int]]:
         """Lines and their contents, without broken ones and scans that are not consistent."""
