@@ -1,8 +1,7 @@
 """Writes sensor records to a ROS bag."""
 
 import sqlite3
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Writer as Writer2
 
 _ROS1, _MCAP, _SQLITE, _FOLDER = ".bag", ".mcap", ".db3", ""
-BAG_SUFFIXES = (_ROS1, _MCAP, _SQLITE, _FOLDER)
+_SUFFIXES = (_ROS1, _MCAP, _SQLITE, _FOLDER)
 """Formats of bags that can be written: ROS 1, two file formats of ROS 2, and a folder of ROS 2."""
 
 _ODOM, _BASE, _LASER, _CAMERA = "odom", "base_link", "laser", "camera_optical_frame"
@@ -73,34 +72,24 @@ def write_bag(path: Path, records: Iterable[SensorRecord]) -> None:
     """
     from rosbags import rosbag1, rosbag2
 
-    try:
-        with _opened(path) as bag:
-            for record in records:
-                bag.write(record)
-    except (OSError, sqlite3.Error, rosbag1.WriterError, rosbag2.WriterError) as error:
-        raise InputError(f"{path}: cannot be written ({error}); choose another path") from error
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator["_Bag"]:
-    from rosbags import rosbag1, rosbag2
-
-    if path.suffix not in BAG_SUFFIXES:
+    ros1 = path.suffix == _ROS1
+    if path.suffix not in _SUFFIXES:
         raise InputError(f"{path.name}: not a kind of bag; end it in .bag, .mcap or .db3, or in nothing for a folder")
     if path.suffix == _SQLITE and set("?#%") & set(str(path.absolute())):
         # rosbags puts the path into a URI as it is
         raise InputError(f"{path}: no .db3 can be written where a path holds ?, # or %; choose another path")
-    with TemporaryDirectory(prefix=".", dir=path.parent) as staging:
-        place = Path(staging, path.stem)
-        if path.suffix == _ROS1:
-            with rosbag1.Writer(place) as writer1:
-                yield _Bag(writer1, ros1=True)
-        else:
-            plugin = rosbag2.StoragePlugin.SQLITE3 if path.suffix == _SQLITE else rosbag2.StoragePlugin.MCAP
-            with rosbag2.Writer(place, version=9, storage_plugin=plugin) as writer2:
-                yield _Bag(writer2, ros1=False)
-        whole = place / f"{place.name}{path.suffix}" if path.suffix in (_MCAP, _SQLITE) else place
-        whole.replace(path)
+    plugin = rosbag2.StoragePlugin.SQLITE3 if path.suffix == _SQLITE else rosbag2.StoragePlugin.MCAP
+    try:
+        with TemporaryDirectory(prefix=".", dir=path.parent) as staging:
+            place = Path(staging, path.stem)
+            with rosbag1.Writer(place) if ros1 else rosbag2.Writer(place, version=9, storage_plugin=plugin) as writer:
+                bag = _Bag(writer, ros1)
+                for record in records:
+                    bag.write(record)
+            whole = place / f"{place.name}{path.suffix}" if path.suffix in (_MCAP, _SQLITE) else place
+            whole.replace(path)
+    except (OSError, sqlite3.Error, rosbag1.WriterError, rosbag2.WriterError) as error:
+        raise InputError(f"{path}: cannot be written ({error}); choose another path") from error
 
 
 class _Bag:
