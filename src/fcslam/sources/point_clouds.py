@@ -22,9 +22,9 @@ from fcslam.sources.bags.messages import ScanMessage
 
 DIRECTIONS: Final = 720
 """In a full turn, at most."""
-_SPACING_RAD: Final = tau / DIRECTIONS
+SPACING_RAD: Final = tau / DIRECTIONS
 _COARSEST: Final = 8
-"""Largest spacing of the directions that a sensor measures, in ``_SPACING_RAD``."""
+"""Largest spacing of the directions that a sensor measures, in ``SPACING_RAD``."""
 _FEWEST_DIRECTIONS: Final = 50
 """A cloud with returns in fewer does not tell how far apart they are."""
 FARTHEST_M: Final = 100.0
@@ -127,7 +127,8 @@ def scan_of_cloud(
     in_base = mounting.in_base(cloud)
     offset_s = float(cloud.times_s.mean()) if len(cloud.times_s) else 0.0
     if motion is not None:
-        in_base = _moved(in_base, cloud.times_s - offset_s, motion)
+        poses = np.column_stack((in_base[:, :2], np.zeros(len(in_base))))
+        in_base[:, :2] = se2.compose(motion.displacement(cloud.times_s[:, None] - offset_s), poses)[:, :2]
     outside = np.hypot(in_base[:, 0], in_base[:, 1]) > band.body_radius_m
     floor = floor_in(in_base[outside], mounting)
     if floor is None and not mounting.is_height_known:
@@ -172,7 +173,7 @@ def directions_in(clouds: Iterable[PointCloud], mounting: CloudMounting) -> int:
     gaps = []
     for cloud in clouds:
         x, y = (cloud.points @ mounting.rotation.T)[:, :2].T
-        seen = np.unique(np.rint(np.arctan2(y, x) / _SPACING_RAD))
+        seen = np.unique(np.rint(np.arctan2(y, x) / SPACING_RAD))
         if len(seen) >= _FEWEST_DIRECTIONS:
             gaps.append(int(np.quantile(np.diff(seen), 0.1)))  # larger gaps are also where nothing is seen
     measured = min(int(np.median(gaps or [1])), _COARSEST)
@@ -185,19 +186,6 @@ def unit_problem(clouds: Iterable[PointCloud]) -> str:
     if not distances_m or (middle_m := float(np.median(distances_m))) <= FARTHEST_M:
         return ""
     return f"the points are {middle_m:.0f} m away, as if in another unit; publish them in metres"
-
-
-def depth_points(depth_m: FloatArray, fx: float, fy: float, cx: float, cy: float) -> FloatArray:
-    """The points of a depth image in the optical frame of its camera (z forward, y down), shape (N, 3).
-
-    Pixels without a finite depth above 0 are left out, and so are rows closer together than a scan needs.
-    """
-    rows = np.arange(0, depth_m.shape[0], max(1, int(fy * _SPACING_RAD)))
-    columns = np.arange(depth_m.shape[1])
-    z = depth_m[rows]
-    x, y = (columns - cx) / fx * z, (rows[:, None] - cy) / fy * z
-    points: FloatArray = np.stack((x, y, z), axis=-1)[np.isfinite(z) & (z > 0.0)]
-    return points
 
 
 def leaning(clouds: Iterable[PointCloud], mounting: CloudMounting) -> FloatArray | None:
@@ -273,13 +261,6 @@ def _fitted(plane: Plane, points: FloatArray) -> Plane | None:
         return None
     normal = axes[:, 0] * np.copysign(1.0, axes[2, 0])
     return normal, float(normal @ middle)
-
-
-def _moved(points: FloatArray, times_s: FloatArray, motion: Sweep) -> FloatArray:
-    """The points in ``base`` at their times, shape (N, 3), in ``base`` at the stamp."""
-    flat = np.column_stack((points[:, :2], np.zeros(len(points))))
-    moved = se2.compose(motion.displacement(times_s[:, None]), flat)
-    return np.column_stack((moved[:, :2], points[:, 2]))
 
 
 def _levelling(normal: FloatArray, heading_rad: float) -> FloatArray:

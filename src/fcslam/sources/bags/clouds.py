@@ -12,7 +12,7 @@ from fcslam.sources.bags.messages import LONGEST_SWEEP_S, header_of
 from fcslam.sources.bags.options import GivenPose
 from fcslam.sources.bags.transforms import in_space, planar
 from fcslam.sources.gate import MAX_STEP_BACK_S
-from fcslam.sources.point_clouds import CloudMounting, PointCloud, depth_points
+from fcslam.sources.point_clouds import SPACING_RAD, CloudMounting, PointCloud
 
 MOST_POINTS: Final = 4_000_000
 """In one message; the largest scanners measure a tenth of it in a turn."""
@@ -190,13 +190,22 @@ def _timed(cloud: PointCloud, times: Any, longest_s: float) -> PointCloud:
 
 
 def _depth_points(content: Any, calibration: Calibration | None) -> FloatArray:
+    """The points of a depth image in the optical frame of its camera (z forward, y down), shape (N, 3).
+
+    Pixels without a finite depth above 0 are left out, and so are rows closer together than a scan needs.
+    """
     if content.encoding not in _DEPTHS:
         raise ValueError(f"the encoding '{content.encoding}' is not that of a depth image, 16UC1 or 32FC1")
     if calibration is None:
         raise ValueError("no calibration (camera_info) of the depth image")
     kind, unit_m = _DEPTHS[content.encoding]
     pixel = np.dtype((">" if content.is_bigendian else "<") + kind)
-    depth_m = pixel_rows(content, pixel.itemsize).view(pixel).astype(np.float64) * unit_m
     camera = calibration.camera
     across, down = content.width / camera.width, content.height / camera.height  # of images that were made smaller
-    return depth_points(depth_m, camera.fx * across, camera.fy * down, camera.cx * across, camera.cy * down)
+    pixels = pixel_rows(content, pixel.itemsize).view(pixel)
+    rows = np.arange(0, len(pixels), max(1, int(camera.fy * down * SPACING_RAD)))
+    z = pixels[rows].astype(np.float64) * unit_m
+    x = (np.arange(content.width) - camera.cx * across) / (camera.fx * across) * z
+    y = (rows[:, None] - camera.cy * down) / (camera.fy * down) * z
+    points: FloatArray = np.stack((x, y, z), axis=-1)[np.isfinite(z) & (z > 0.0)]
+    return points
