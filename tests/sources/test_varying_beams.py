@@ -152,7 +152,7 @@ def test_a_laser_that_falls_silent_does_not_hold_up_the_other(tmp_path):
         (
             front_and_rear(),
             BagOptions(("/scan", "/rear"), laser_poses=((0.0, 0.0, 0.0),)),
-            "1 laser-pose for 2 scan-topic of --sensors",
+            "1 laser-pose for the lasers /scan, /rear; give one for each",
         ),
     ],
 )

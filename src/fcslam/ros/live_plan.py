@@ -150,7 +150,7 @@ class LivePlanner:
             return None
         try:
             plan = plan_of(self._robot, self._options, self._topics)
-            rig, notes = plan.rig([self._farthest_m(laser) for laser in plan.lasers], self._options)
+            rig, notes = plan.rig([self._farthest_m(laser) for laser in plan.lasers])
             clouds = None
             if plan.scans.is_whole(self._topics.scans[0]):
                 clouds, of_clouds = plan.scans.whole_reader(self._topics.scans[0])

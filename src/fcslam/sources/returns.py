@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fcslam.errors import SourceError
 from fcslam.records import FloatArray, LaserScan, Ranges, frozen
 from fcslam.sources.faults import FEWEST
 from fcslam.sources.pose import Pose
@@ -59,10 +58,6 @@ class FloorLine(NamedTuple):
             f"the laser leans and sees the floor: a line {self.distance_m:.1f} m away, at "
             f"{degrees(self.heading_rad):.0f} deg among its beams, moves with the robot; mount it level"
         )
-
-    def mirrored(self) -> "FloorLine":
-        """As the laser sees it upside down."""
-        return self._replace(heading_rad=-self.heading_rad)
 
     def left_out(self, scan: LaserScan) -> LaserScan:
         """The scan with NaN, an invalid range, for what would be at the floor or beyond it."""
@@ -111,20 +106,18 @@ class RangeSample:
                 found.append(float(value))
         return tuple(found)
 
-    def check(self, path: Path, which: str, remedy: str) -> None:
-        """Refuse a recording that cannot be mapped.
+    def problem(self, which: str, remedy: str) -> str:
+        """Why the recording cannot be mapped; empty if it can.
 
         Args:
-            path: of the recording.
             which: the laser, empty or with a blank before it.
             remedy: what to check if nearly no beam has a return.
         """
-        if len(self._samples) >= FEWEST and (problem := self._problem(which, remedy)):
-            raise SourceError(f"{path}: {problem}")
-
-    def _problem(self, which: str, remedy: str) -> str:
+        if len(self._samples) < FEWEST:
+            return ""
         returns = np.concatenate([_returns(one) for one in self._samples])
-        beyond = np.concatenate([one.values[_is_beyond(one)] for one in self._samples])
+        beyond = np.concatenate([one.values[one.values >= one.range_max_m] for one in self._samples])
+        beyond = beyond[beyond < inf]
         beams = sum(len(one.values) for one in self._samples)
         nearest, farthest = self._samples[0].range_min_m, self._samples[0].range_max_m
         limits = f"({nearest:g} m to {farthest:g} m)"
@@ -172,14 +165,7 @@ def is_apart(a: Pose, b: Pose) -> bool:
 
 def _returns(sample: _Sample) -> FloatArray:
     values = sample.values.astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        is_return = (values > max(sample.range_min_m, 0.0)) & (values < sample.range_max_m)
-    return values[is_return]
-
-
-def _is_beyond(sample: _Sample) -> np.ndarray:
-    with np.errstate(invalid="ignore"):
-        return (sample.values >= sample.range_max_m) & (sample.values < inf)
+    return values[(values > max(sample.range_min_m, 0.0)) & (values < sample.range_max_m)]
 
 
 def _is_varied(values: FloatArray | Ranges) -> bool:

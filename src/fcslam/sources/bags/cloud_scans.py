@@ -106,8 +106,9 @@ class CloudScans:
         return self._mountings[topic, frame]
 
     def _stated_mounting(self, topic: Topic, frame: str) -> tuple[CloudMounting, list[str]]:
-        if self._options.laser_poses:
-            return given_cloud_mounting(self._options.laser_poses[self._scans.index(topic)], topic.type, frame), []
+        given = dict(zip(self._scans, self._options.laser_poses, strict=False))
+        if topic in given:
+            return given_cloud_mounting(given[topic], topic.type, frame), []
         try:
             T_base_sensor = self._tree.fixed(self._base_frame_of(frame), frame)
         except NoTransformError as error:

@@ -32,9 +32,6 @@ class BagCorrection:
     """For each laser, where it sees the floor, which is left out. Empty: none does."""
 
 
-UNCORRECTED: Final = BagCorrection()
-
-
 @dataclass(frozen=True, slots=True)
 class BagOptions:
     """Options for one bag; None: chosen automatically."""
@@ -50,6 +47,6 @@ class BagOptions:
     base_frame: str | None = None
     robot: str | None = None
     cloud_band: CloudBand = field(default_factory=CloudBand)
-    correction: BagCorrection = UNCORRECTED
+    correction: BagCorrection = field(default_factory=BagCorrection)
     in_3d: bool = False
     """Whether point clouds are read whole, and not a band of their heights as a 2D scan."""

@@ -19,7 +19,7 @@ from fcslam.sources.bags.container import Topic
 from fcslam.sources.bags.fixes import FixReader
 from fcslam.sources.bags.imu import ImuReader
 from fcslam.sources.bags.messages import OdometryReading, ScanMessage, odometry_in
-from fcslam.sources.bags.options import NO_ODOMETRY, UNCORRECTED, BagCorrection, BagOptions
+from fcslam.sources.bags.options import NO_ODOMETRY, BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import Item
 from fcslam.sources.bags.rig import RecordedLaser, Rig, mountings_of, recorded_laser, turned_beams
 from fcslam.sources.bags.robots import BagRobot, listed, usual
@@ -39,7 +39,6 @@ _STRIDE = 5
 """Every fifth scan is compared to see whether the robot moves."""
 FEWEST_LAGS: Final = 4
 """Messages that show a clock."""
-EACH_LASER: Final = "give one for each laser, in the same order"
 
 
 class OdometryInput(NamedTuple):
@@ -67,6 +66,7 @@ class OdometryInput(NamedTuple):
 class BagPlan(NamedTuple):
     """What is read of one robot, in a bag or live, and how."""
 
+    options: BagOptions
     topics: Topics
     tree: TransformTree
     scans: CloudScans
@@ -99,8 +99,9 @@ class BagPlan(NamedTuple):
         odometry = () if self.odometry is None else self.odometry.topics
         return list(dict.fromkeys((*odometry, *self.topics.scans, *camera)))
 
-    def items(self, message: BagMessage, correction: BagCorrection = UNCORRECTED) -> list[Item]:
+    def items(self, message: BagMessage) -> list[Item]:
         """What is read of a message; raises ValueError if it is invalid."""
+        correction = self.options.correction
         if message.topic in self.topics.scans:
             if self.scans.is_whole(message.topic):
                 return [self.scans.cloud(message)]
@@ -126,20 +127,21 @@ class BagPlan(NamedTuple):
         """Reads the fixes; ``audit`` counts the faults. None: their clock is as the plan says."""
         return FixReader(self.tree, self.frames[1], self.fixes_ahead_s if ahead_s is None else ahead_s, audit)
 
-    def rig(self, farthest_m: Sequence[float], options: BagOptions) -> tuple[Rig, list[str]]:
+    def rig(self, farthest_m: Sequence[float]) -> tuple[Rig, list[str]]:
         """The mounted lasers, with these largest ranges, and the camera, and notes about them.
 
         Raises:
             NoTransformError: tf does not say where a laser sits, yet.
             InputError: a laser cannot be read as it is mounted.
         """
-        poses, base_frame = options.laser_poses, self.frames[1]
+        poses, base_frame = self.options.laser_poses, self.frames[1]
         if poses and len(poses) != len(self.lasers):
             named = ", ".join(laser.name for laser in self.lasers)
-            raise InputError(f"{len(poses)} laser-pose for the lasers {named}; {EACH_LASER}")
-        mountings = [
-            _moved(mounted, options.correction) for mounted in mountings_of(self.lasers, self.tree, base_frame, poses)
-        ]
+            raise InputError(
+                f"{len(poses)} laser-pose for the lasers {named}; give one for each laser, in the same order"
+            )
+        stated = mountings_of(self.lasers, self.tree, base_frame, poses)
+        mountings = [_moved(mounted, self.options.correction) for mounted in stated]
         notes = [
             f"the laser of {laser.name} is tilted by {degrees(mounted.tilt_rad):.1f} degrees, read as level"
             for laser, mounted in zip(self.lasers, mountings, strict=True)
@@ -225,6 +227,7 @@ class _Planner:
         )
         self._notes += [note for _, note in clocks.values() if note]
         return BagPlan(
+            self._options,
             topics,
             self._tree,
             self._scans,

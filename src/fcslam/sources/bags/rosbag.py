@@ -21,7 +21,7 @@ from fcslam.sources.bags.imu import ImuReading
 from fcslam.sources.bags.messages import OdometryReading
 from fcslam.sources.bags.options import BagCorrection, BagOptions
 from fcslam.sources.bags.pairing import PosedScan
-from fcslam.sources.bags.plan import EACH_LASER, BagPlan, plan_of
+from fcslam.sources.bags.plan import BagPlan, plan_of
 from fcslam.sources.bags.reader import Numbered, SensorReader
 from fcslam.sources.bags.rig import Rig
 from fcslam.sources.bags.robots import BagRobot, robot_of, robots_of, slashed
@@ -60,11 +60,6 @@ class RosBag:
         self.path = path
         self._notes = notes
         self.options = options or BagOptions()
-        topics, poses = self.options.scan_topics, self.options.laser_poses
-        if topics and 0 < len(poses) < len(topics):
-            raise SourceError(
-                f"{path}: {len(poses)} laser-pose for {len(topics)} scan-topic of --sensors; {EACH_LASER}"
-            )
         self.bag: Messages = DecodedBag(path) if robot is None else robot.bag
         self._given_robot = robot
         self._audit = _audit()
@@ -116,7 +111,8 @@ class RosBag:
         watch = ScanWatch(audit)
         rig, placeholders = self._reading.rig, self._reading.placeholders
         correction = self.options.correction
-        floors = [floor and floor.mirrored() if correction.upside_down else floor for floor in correction.floors]
+        sign = -1.0 if correction.upside_down else 1.0
+        floors = [floor and floor._replace(heading_rad=sign * floor.heading_rad) for floor in correction.floors]
         found, faults = self._fixes
         fixes = deque(found)
         for kind, fault in faults.counts.items():
@@ -166,7 +162,7 @@ class RosBag:
         reader = SensorReader(plan.lasers, plan.odometry is not None, audit, imu)
         for message in self.bag.read(plan.read_topics(with_images)):
             try:
-                items = plan.items(message, self.options.correction)
+                items = plan.items(message)
             except ValueError as error:
                 errors.setdefault(message.topic.name, f"message {message.number} of it: {error}")
                 is_image = message.topic == plan.topics.camera
@@ -199,10 +195,11 @@ class RosBag:
         self._refuse(audit.faults(), scans, odometry, errors)
         which = [f" of {laser.name}" for laser in lasers]
         for sample, its, recorded in zip(samples, which, lasers, strict=True):
-            sample.check(self.path, its, _OF_CLOUDS if recorded.is_level else _OF_SCANS)
+            if problem := sample.problem(its, _OF_CLOUDS if recorded.is_level else _OF_SCANS):
+                raise SourceError(f"{self.path}: {problem}")
         placeholders = tuple(sample.placeholders() for sample in samples)
         with self._translated(errors):
-            rig, rig_notes = plan.rig(farthest_m, self.options)
+            rig, rig_notes = plan.rig(farthest_m)
         notes = [
             *self.bag.notes,
             *(
@@ -269,7 +266,7 @@ class RosBag:
         options, own = self.options, {slashed(topic.name) for topic in robot.topics}
         lasers = [k for k, topic in enumerate(options.scan_topics) if slashed(topic) in own]
         if options.scan_topics:
-            poses = tuple(options.laser_poses[k] for k in lasers if options.laser_poses)
+            poses = tuple(pose for k in lasers for pose in options.laser_poses[k : k + 1])
             topics = tuple(options.scan_topics[k] for k in lasers)
             options = replace(options, scan_topics=topics, laser_poses=poses)
         called = "_".join(filter(None, (name, robot.name.strip("/").replace("/", "_")))) or self.name

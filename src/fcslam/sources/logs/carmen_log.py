@@ -102,7 +102,8 @@ class CarmenLog:
             admitted.append(k)
         faults, scan_count, duration_s = audit.faults(), driven.count, driven.duration_s
         check_consistency(path, faults, scan_count, len(log.odometry))
-        sample.check(path, "", "the unit of the ranges")
+        if problem := sample.problem("", "the unit of the ranges"):
+            raise SourceError(f"{path}: {problem}")
         pose_from_odometry = not driven.moves and bool((log.odometry != log.odometry[:1]).any())
         if pose_from_odometry:
             driven = PathSummary()
