@@ -124,7 +124,8 @@ def reader_of(
         raise SourceError(f"{where} has hardly any points; check the driver, or choose another by --sensors scan-topic")
     if problem := unit_problem(first):
         raise SourceError(f"{where}: {problem}")
-    if max(map(_elevations, first)) < _ONE_RING_RAD:
+    elevations = [np.arctan2(cloud.points[:, 2], np.hypot(*cloud.points[:, :2].T)) for cloud in first]
+    if max(float(np.ptp(np.quantile(each, (0.05, 0.95)))) for each in elevations if len(each)) < _ONE_RING_RAD:
         raise SourceError(f"{where} has one ring, so it is a 2D laser; map it without --3d, or with its laser scans")
     notes = []
     stamps = np.array([cloud.stamp for cloud in first])
@@ -187,12 +188,6 @@ def _turns(xy: Sequence[FloatArray], times_s: Sequence[NDArray[np.float64]]) -> 
     """Rates, in rad/s, of the clouds in which the LiDAR turns by these times."""
     turns = (turn_of(points, times) for points, times in zip(xy, times_s, strict=True) if len(points) == len(times))
     return [turn[1] for turn in turns if turn is not None]
-
-
-def _elevations(cloud: PointCloud) -> float:
-    horizontal = np.hypot(cloud.points[:, 0], cloud.points[:, 1])
-    low, high = np.quantile(np.arctan2(cloud.points[:, 2], horizontal), (0.05, 0.95)) if len(horizontal) else (0.0, 0.0)
-    return float(high - low)
 
 
 def _on_floor(first: Sequence[PointCloud], mounting: CloudMounting) -> CloudMounting | None:

@@ -73,7 +73,8 @@ def robots_of(bag: Messages, options: BagOptions) -> tuple[BagRobot, ...]:
     members, spaces = _members(heard, bag)
     labels = {(_prefix(member.frame), member.space) for member in members}
     robots = [member for member in members if member.moves] or (members if len(labels) == len(members) else [])
-    if len(robots) < 2 and not (robots and any(_is_apart(member, robots[0]) for member in members)):
+    spaced = [member for member in members if member.space and any(robot.space for robot in robots)]
+    if len(robots) < 2 and not any(set(each.transforms).isdisjoint(robots[0].transforms) for each in spaced):
         return (_only_robot(bag, robots or members, options),)
     notes = _lost_scans(bag, robots, members)
     found = [
@@ -97,10 +98,6 @@ def robots_of(bag: Messages, options: BagOptions) -> tuple[BagRobot, ...]:
     if options.scan_topics and not having:  # what is wrong with the topics is said where they are read
         return (_only_robot(bag, members, options),)
     return tuple(sorted(having or found, key=lambda robot: robot.name))
-
-
-def _is_apart(member: _Member, robot: _Member) -> bool:
-    return bool(robot.space and member.space) and not set(member.transforms) & set(robot.transforms)
 
 
 def robot_of(bag: Messages, options: BagOptions) -> BagRobot:
@@ -143,7 +140,8 @@ def _members(heard: Sequence[Topic], bag: Messages) -> tuple[list[_Member], set[
     census = bag.census
     scans = [topic for topic in heard if topic.type in SCANS]
     odometry = [topic for topic in heard if topic.type == ODOMETRY and not is_truth(topic.name)]
-    space_of = _spaces(scans, [*odometry, *filter(is_transforms, heard)])
+    marked = {space for mark in (*odometry, *filter(is_transforms, heard)) for space in _namespaces(mark)}
+    space_of = {topic: _innermost(topic, marked) for topic in scans}
     spaces = set(space_of.values())
     members: dict[object, _Member] = {}
     trees: dict[tuple[Topic, ...], TransformTree] = {}
@@ -167,14 +165,6 @@ def _members(heard: Sequence[Topic], bag: Messages) -> tuple[list[_Member], set[
             for member in inside if len(inside) == 1 else [each for each in inside if each.holds(base)][:1]:
                 member.base_frames.setdefault(topic, base)
     return found, spaces
-
-
-def _spaces(scans: Sequence[Topic], marks: Sequence[Topic]) -> dict[Topic, str]:
-    """The namespace of each topic of scans: the innermost one around it with any of the odometry and tf ``marks``."""
-    return {
-        topic: next((space for space in _namespaces(topic) if any(space in _namespaces(mark) for mark in marks)), "")
-        for topic in scans
-    }
 
 
 def _only_robot(bag: Messages, members: Sequence[_Member], options: BagOptions) -> BagRobot:

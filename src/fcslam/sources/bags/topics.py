@@ -79,15 +79,16 @@ def choose_topics(
       if the user names it;
     - camera: calibrated, most messages, compressed images, first by name.
     """
-    heard, scans = known.heard, _scans(known)
+    heard, every = known.heard, (*known.own, *known.others)
+    depth = [topic for topic in heard if topic.type == IMAGE and is_depth(topic.name)]
+    scans = [topic for topic in heard if topic.type in SCANS or (topic in depth and calibration_beside(topic, every))]
     if not scans and not options.scan_topics:
         packed = [topic.name for topic in heard if topic.type == COMPRESSED_IMAGE and is_depth(topic.name)]
-        bare = [topic.name for topic in heard if topic.type == IMAGE and is_depth(topic.name)]
         remedy = known.remedy
         if unread := [topic for topic in heard if OTHER_ENCODING in topic.type]:
             remedy = f"{unread[0].name} is not in CDR; record it by `ros2 bag record`"
-        if bare:
-            remedy = f"the depth images of {bare[0]} need their {info_beside(bare[0])}"
+        if depth:
+            remedy = f"the depth images of {depth[0].name} need their {info_beside(depth[0].name)}"
         if packed:
             remedy = f"the compressed depth images of {packed[0]} are not read; record {packed[0].rpartition('/')[0]}"
         what = f"no laser scans ({SCAN}), point clouds ({POINT_CLOUD}) or depth images"
@@ -115,15 +116,6 @@ def choose_topics(
         ]
         notes += _note(known, "odometry", "--sensors odom-topic", odometries[0], measured)
     return Topics(tuple(lasers), tuple(odometries), known.transforms, camera, camera_info, tuple(notes))
-
-
-def _scans(known: KnownTopics) -> list[Topic]:
-    return [
-        topic
-        for topic in known.heard
-        if topic.type in SCANS
-        or (topic.type == IMAGE and is_depth(topic.name) and calibration_beside(topic, (*known.own, *known.others)))
-    ]
 
 
 def _best_scan(scans: Sequence[Topic], field_of_view_rad: Callable[[Topic], float]) -> Topic:
