@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from math import hypot, inf, remainder, tau
+from math import hypot, inf, isnan, remainder, tau
 from typing import Final
 
 from fcslam.sources.faults import FEWEST
@@ -39,7 +39,7 @@ class PathSummary:
         """Append the next pose; ``stamp`` in seconds, ``pose`` in metres and radians."""
         if self._pose is None or self._first is None:
             self._first = pose
-        elif pose != self._pose:
+        elif pose != self._pose and not isnan(pose[0]):
             self.moves = True
             self.length_m += hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
             if not self.says_something:

@@ -3,8 +3,7 @@
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
-from itertools import islice, pairwise
-from math import isnan
+from itertools import pairwise
 from typing import Protocol, Self
 
 from fcslam.errors import SourceError
@@ -120,9 +119,9 @@ class Part(Derived):
     def survey(self) -> Survey:
         """As in Source."""
         track = PathSummary()
-        for scan in islice((each for each in self.records() if isinstance(each, LaserScan | CloudScan)), self._count):
-            pose = pose_of(scan.T_odom_base)
-            track.add(scan.stamp, UNKNOWN_POSE if isnan(pose[0]) else pose)
+        for record in self.records():
+            if isinstance(record, LaserScan | CloudScan):
+                track.add(record.stamp, pose_of(record.T_odom_base))
         return replace(
             self._source.survey(),
             scan_count=track.count,
