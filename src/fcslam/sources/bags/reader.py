@@ -101,11 +101,7 @@ class SensorReader:
     """Turns scans, odometry and images into consistent entries with poses."""
 
     def __init__(
-        self,
-        lasers: Sequence[RecordedLaser],
-        has_odometry: bool,
-        audit: Audit,
-        imu: Iterable[ImuReading] = (),
+        self, lasers: Sequence[RecordedLaser], has_odometry: bool, audit: Audit, imu: Iterable[ImuReading] = ()
     ) -> None:
         """``audit`` counts the faults; ``imu`` are readings of the IMU of a robot without odometry."""
         self._joiners = {number: SectorJoiner() for number, laser in enumerate(lasers) if laser.is_in_sectors}

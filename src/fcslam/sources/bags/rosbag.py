@@ -117,7 +117,7 @@ class RosBag:
         fixes = deque(found)
         for kind, fault in faults.counts.items():
             audit.add(kind, fault.first_line, fault.count)
-        for number, entry in self._entries(audit, with_images=rig.camera is not None, imu=self._imu):
+        for number, entry in self._entries(audit, {}, with_images=rig.camera is not None, imu=self._imu):
             if isinstance(entry, PosedScan):
                 record = rig.scan(entry)
                 while fixes and fixes[0].stamp <= record.stamp:
@@ -152,13 +152,9 @@ class RosBag:
         return tuple(sorted(found, key=lambda fix: fix.stamp)), audit.faults()
 
     def _entries(
-        self,
-        audit: Audit,
-        errors: dict[str, str] | None = None,
-        with_images: bool = False,
-        imu: Iterable[ImuReading] = (),
+        self, audit: Audit, errors: dict[str, str], with_images: bool = False, imu: Iterable[ImuReading] = ()
     ) -> Iterator[Numbered]:
-        plan, errors = self.plan, {} if errors is None else errors
+        plan = self.plan
         reader = SensorReader(plan.lasers, plan.odometry is not None, audit, imu)
         for message in self.bag.read(plan.read_topics(with_images)):
             try:

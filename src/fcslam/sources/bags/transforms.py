@@ -13,9 +13,6 @@ from fcslam.geometry import se3
 from fcslam.records import FloatArray, Transform
 from fcslam.sources.pose import Pose
 
-Quaternion = tuple[float, float, float, float]
-"""Unit quaternion (x, y, z, w)."""
-
 _STILL = 0.01
 """Largest difference between the messages of a fixed transform, in metres or quaternion units."""
 _LARGEST_SWAY_RAD = radians(20.0)
@@ -47,8 +44,8 @@ _NO_ODOMETRY = ("map", *USUAL_BASES)
 IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
-def transform_of(translation_m: tuple[float, float, float], rotation: Quaternion) -> Transform:
-    """Check a transform and normalise its quaternion; raises ValueError if it is invalid."""
+def transform_of(translation_m: tuple[float, float, float], rotation: tuple[float, float, float, float]) -> Transform:
+    """Check a transform and normalise its quaternion (x, y, z, w); raises ValueError if it is invalid."""
     x, y, z, w = rotation
     length = sqrt(x * x + y * y + z * z + w * w)
     if not abs(length - 1.0) < 0.1:

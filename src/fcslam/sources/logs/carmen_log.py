@@ -79,13 +79,8 @@ class CarmenLog:
 
     @cached_property
     def _reading(self) -> _Reading:
-        path, log, audit, sample, driven = (
-            self._path,
-            self._log,
-            Audit(),
-            RangeSample(len(self._log.stamps)),
-            PathSummary(),
-        )
+        path, log, audit, driven = self._path, self._log, Audit(), PathSummary()
+        sample = RangeSample(len(log.stamps))
         if not log.stamps:
             list(self._consistent(Beams(0, 0.0, 0.0), audit))
             seen = f"; {audit.faults()}" * bool(audit.faults())
