@@ -43,7 +43,7 @@ def image_of(content: Any, kind: str, bag_time_ns: int) -> ImageMessage:
     """
     if kind == COMPRESSED_IMAGE:
         encoded = np.asarray(content.data, dtype=np.uint8).tobytes()
-        image_suffix(encoded)
+        image_format(encoded)
     else:
         encoded = _encoded_png(content)
     stamp, _ = header_of(content.header, bag_time_ns)
@@ -88,10 +88,10 @@ def calibration_of(content: Any) -> Calibration:
     return Calibration(frame, camera, bool(np.any(D)))
 
 
-def image_suffix(encoded: bytes) -> str:
-    """``jpg`` or ``png`` by the first bytes; raises ValueError for anything else."""
+def image_format(encoded: bytes) -> str:
+    """``jpeg`` or ``png``, by the first bytes; raises ValueError for anything else."""
     if encoded.startswith(_JPEG):
-        return "jpg"
+        return "jpeg"
     if encoded.startswith(_PNG):
         return "png"
     raise ValueError("neither JPEG nor PNG")

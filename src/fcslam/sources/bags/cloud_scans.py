@@ -45,8 +45,8 @@ class CloudScans:
         """What is wrong with the mountings."""
         self._robot, self._scans, self._options, self._tree = robot, scans, options, tree
         self._base_frame_of = base_frame_of
-        self._calibrations: dict[Topic, Calibration | None] = {}
-        self._longest_s: dict[Topic, float] = {}
+        self._known: dict[Topic, tuple[Calibration | None, float]] = {}
+        """The camera of depth images, and the longest time that a cloud takes."""
         self._mountings: dict[tuple[Topic, str], CloudMounting] = {}
 
     def is_whole(self, topic: Topic) -> bool:
@@ -65,16 +65,14 @@ class CloudScans:
     def cloud(self, message: BagMessage) -> PointCloud:
         """The points of a message; raises ValueError if it is invalid."""
         topic = message.topic
-        if topic not in self._longest_s:
+        if topic not in self._known:
             info = calibration_beside(topic, self._robot.topics) if topic.type == IMAGE else None
-            self._calibrations[topic] = calibration_in(self._robot, info)
             headers = valid(
                 islice(self._robot.bag.read([topic]), FIRST_MESSAGES),
                 lambda each: header_of(each.content.header, each.unstamped_ns),
             )
-            self._longest_s[topic] = longest_cloud_s(headers)
-        calibration, longest_s = self._calibrations[topic], self._longest_s[topic]
-        return cloud_of(message.content, topic.type, message.unstamped_ns, calibration, longest_s)
+            self._known[topic] = calibration_in(self._robot, info), longest_cloud_s(headers)
+        return cloud_of(message.content, topic.type, message.unstamped_ns, *self._known[topic])
 
     def whole_reader(self, topic: Topic) -> tuple[CloudReader, tuple[str, ...]]:
         """How the clouds of a topic are read in 3D, and notes about it."""

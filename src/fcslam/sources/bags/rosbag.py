@@ -196,7 +196,8 @@ class RosBag:
         placeholders = tuple(sample.placeholders() for sample in samples)
         with self._translated(errors):
             rig, rig_notes = plan.rig(farthest_m)
-        notes = [
+        notes = (
+            *self._notes,
             *self.bag.notes,
             *(
                 f"{self.path}: {its.unstamped} of {its.count} messages of {topic.name} have no stamp; their "
@@ -211,9 +212,8 @@ class RosBag:
             *plan.topics.notes,
             *plan.notes,
             *(f"{self.path}: {note}" for note in rig_notes),
-        ]
-        faults, notes = audit.faults(), [*self._notes, *notes]
-        survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, faults, tuple(notes), rig.camera)
+        )
+        survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, rig.camera)
         return _Reading(survey, rig, placeholders)
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary, errors: Mapping[str, str]) -> None:

@@ -121,8 +121,6 @@ def choose_topics(
 def _best_scan(scans: Sequence[Topic], field_of_view_rad: Callable[[Topic], float]) -> Topic:
     kinds = ([topic for topic in scans if topic.type in types] for types in (LASER_SCANS, SCANS, (IMAGE,)))
     scans = next(filter(None, kinds))
-    if len(scans) == 1:
-        return scans[0]
     view_rad = {topic: field_of_view_rad(topic) for topic in scans}
     wide = [topic for topic in scans if view_rad[topic] > max(view_rad.values()) - 2.0 * SAME_VIEW_RAD]
     return min(

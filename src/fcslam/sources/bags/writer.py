@@ -19,7 +19,7 @@ from fcslam.records import (
     SensorRecord,
     Transform,
 )
-from fcslam.sources.bags.camera import image_suffix
+from fcslam.sources.bags.camera import image_format
 from fcslam.sources.bags.codec import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -47,7 +47,6 @@ _SCAN_TOPIC = "/scan"
 _FIRST_TOPICS = {"/odom": ODOMETRY, "/tf": TRANSFORMS, "/tf_static": TRANSFORMS, _SCAN_TOPIC: SCAN}
 """Odometry first: at equal times it is read before the scan. Other topics begin with their first message."""
 _IMAGE_TOPIC, _CAMERA_INFO_TOPIC = "/camera/image_raw/compressed", "/camera/camera_info"
-_IMAGE_FORMATS = {"jpg": "jpeg", "png": "png"}
 _END_OF_TIME_S = 2**31
 
 
@@ -141,7 +140,7 @@ class _Bag:
 
     def _put_image(self, stamp_ns: int, image: CameraImage) -> None:
         try:
-            encoding = _IMAGE_FORMATS[image_suffix(image.encoded)]
+            encoding = image_format(image.encoded)
         except ValueError as error:
             raise InputError(f"an image at {image.stamp} s cannot be written ({error})") from error
         header = self._codec.header(stamp_ns, _CAMERA)
