@@ -25,7 +25,10 @@ def compiled():
 """The signatures of every function that is compiled, by its name."""
 
 SCRIPT = """
+import numpy as np
 from fcslam.mission.driving import one_by_one
+from fcslam.places.vocabulary import VocabularyConfig
+from fcslam.robot.backend import OwnPlaces
 from fcslam.robot.frontend import RobotConfig
 from fcslam.warmup import WARM_UPS, is_cold, warm_up_decoding, warm_up_fleet
 from fcslam.sources import open_source
@@ -61,6 +64,11 @@ of_fleet = news(warm)
 for run in WARM_UPS:
     run()
 hot = compiled()
+places = OwnPlaces(VocabularyConfig(train_batch=2))
+for k in range(4):
+    places.store(k, np.zeros((0, 2)))
+places.most_similar(3, range(3), 1)
+places.forget(0)  # as after many visits of one place
 with one_by_one([open_source(path) for path in sys.argv[2:]], RobotConfig()) as robots:
     legs = sum(len(list(robot)) for robot in robots)
 print(json.dumps([sum(map(len, cold.values())), sum(map(len, warm.values())), sum(map(len, hot.values())),

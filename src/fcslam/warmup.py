@@ -82,6 +82,7 @@ def warm_up_robot() -> None:
         places.store(k, surface)
         places.most_similar(k, range(k), 3)
     places.motions(0, 1)
+    places.forget(0)
 
 
 def warm_up_tracking(config: RobotConfig) -> None:
