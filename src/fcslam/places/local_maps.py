@@ -87,7 +87,7 @@ class SessionMaps:
 
 
 def agreement(a: SessionMaps, b: SessionMaps, T_a_b: FloatArray, drift: tuple[float, float]) -> PlaceAgreement:
-    """Compare the local maps of two sessions wherever the first one was near a place of the second.
+    """Compare the local maps of two sessions wherever a place of the first one is near a place of the second.
 
     ``T_a_b`` between their frames at each keyscan of b, shape (N, P), metres and radians; NaN: not known. ``drift``:
     its largest error at one place, metres and radians.
@@ -98,8 +98,9 @@ def agreement(a: SessionMaps, b: SessionMaps, T_a_b: FloatArray, drift: tuple[fl
 
     places = [row for row in b.places if np.isfinite(T_a_b[row, 0])]
     in_a = b.group.compose(T_a_b[places], b.poses[places])
-    found_m, found_rows = cKDTree(a.positions(a.poses)).query(a.positions(in_a), distance_upper_bound=LOCAL_RADIUS_M)
-    nearest = np.asarray(found_rows)
+    places_a = a.positions(a.poses[a.places])
+    found_m, found = cKDTree(places_a).query(a.positions(in_a), distance_upper_bound=LOCAL_RADIUS_M)
+    nearest = np.append(a.places, -1)[found]
     # Paths that never come near each other may have seen the same walls from two sides.
     reach_m = LOCAL_M if np.any(found_m <= LOCAL_M) else LOCAL_RADIUS_M
     near = _at_most(np.flatnonzero(found_m <= reach_m), MOST_LOCAL_MAPS)
