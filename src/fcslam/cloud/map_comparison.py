@@ -30,6 +30,10 @@ RIVALS = 2
 """Transforms elsewhere at which local maps are compared: those with the best scores."""
 
 
+Poses = tuple[FloatArray, FloatArray]
+"""Of the keyscans of two sessions, shape (N, P) each."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Compared:
     i: int
@@ -161,21 +165,27 @@ class MapComparison(Kept):
         identity = np.broadcast_to(group_of(poses_b).identity, poses_b.shape)
         return _fit(self._maps_of(sessions[0], poses_a), self._maps_of(sessions[1], poses_b), identity)
 
-    def seen_m(self, sessions: tuple[str, str], poses_a: FloatArray, poses_b: FloatArray) -> float:
-        """As in ``MapFit``, at poses (N, P) in the frame of one map, around where the paths come nearest."""
+    def of_join(self, sessions: tuple[str, str], joint: Poses, own: Poses, fit: MapFit | None) -> MapFit:
+        """The fit of two sessions in a joint map with its ``seen_m``, measured around where their paths come nearest.
+
+        The local maps are those at their ``own`` poses, which other comparisons have built. ``fit``: as found before.
+        """
         from scipy.spatial import cKDTree
 
         from fcslam.lidar.uniqueness import align_map
 
-        maps_a, maps_b = self._maps_of(sessions[0], poses_a), self._maps_of(sessions[1], poses_b)
-        group = group_of(poses_a)
-        apart_m, _ = cKDTree(poses_a[:, : group.axes]).query(poses_b[:, : group.axes])
-        middle = poses_b[np.argmin(apart_m), : group.axes]
-        (near_a, i, _), (near_b, j, _) = maps_a.around(middle), maps_b.around(middle)
+        group, (maps_a, maps_b) = group_of(joint[0]), map(self._maps_of, sessions, own)
+        apart_m, found = cKDTree(joint[0][:, : group.axes]).query(joint[1][:, : group.axes])
+        nearest, j = np.asarray(found), int(np.argmin(apart_m))
+        if fit is None:
+            T_i_j = group.between(joint[0][nearest], joint[1])
+            fit = _fit(maps_a, maps_b, group.compose(group.compose(own[0][nearest], T_i_j), group.inverse(own[1])))
+        near_a, i, _ = maps_a.around(own[0][nearest[j], : group.axes])
+        near_b, j, _ = maps_b.around(own[1][j, : group.axes])
         if not len(near_a) or not len(near_b):
-            return 0.0
-        whole_a, whole_b = maps_a.whole(near_a, i), maps_b.whole(near_b, j)
-        return align_map(whole_a, whole_b, _between(poses_a[i], group.identity, poses_b[j])).known_m
+            return fit
+        T_i_j = _between(joint[0][i], group.identity, joint[1][j])
+        return replace(fit, seen_m=align_map(maps_a.whole(near_a, i), maps_b.whole(near_b, j), T_i_j).known_m)
 
     def _maps_of(self, session: str, poses: FloatArray) -> SessionMaps:
         """The local maps of a session whose keyscans have these poses (N, P): the kept ones if nothing has changed."""
