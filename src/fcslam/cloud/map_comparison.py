@@ -129,11 +129,8 @@ class MapComparison(Kept):
         # SciPy's transforms take as long to load as a hundred scans, and most missions compare no maps.
         from fcslam.lidar.uniqueness import align_map, alignments, parallel_headings
 
-        group, maps_a, maps_b = (
-            group_of(a.poses),
-            self._maps_of(sessions[0], a.poses),
-            self._maps_of(sessions[1], b.poses),
-        )
+        maps_a, maps_b = self._maps_of(sessions[0], a.poses), self._maps_of(sessions[1], b.poses)
+        group = maps_a.group
         near_a, i, is_complete_a = maps_a.around(a.poses[members.i, : group.axes].mean(axis=0))
         near_b, j, is_complete_b = maps_b.around(b.poses[members.j, : group.axes].mean(axis=0))
         keyscans = min(len(near_a), len(near_b))
@@ -141,19 +138,19 @@ class MapComparison(Kept):
             return replace(earlier, closures=len(members), size=len(a) + len(b))
         if not keyscans:
             return None
-        frames, T_a_i, T_b_j = local_frames(a, b, members), a.poses[i], b.poses[j]
-        T_i_j, fit = _between(T_a_i, T_a_b, T_b_j), _fit(maps_a, maps_b, frames)
+        frames = local_frames(a, b, members)
+        T_i_j, fit = _between(a.poses[i], T_a_b, b.poses[j]), _fit(maps_a, maps_b, frames)
         if refutation(fit) is None:
             fit = replace(fit, seen_through=self._space.seen_through(sessions, a.poses, b.poses, frames))
         is_searched = refutation(fit) is not None  # then no transform elsewhere matters
         if not is_searched and may_decide(fit):
             is_searched = True
-            whole_a, whole_b = maps_a.whole(near_a, i), maps_b.whole(near_b, j)
-            best = align_map(whole_a, whole_b, T_i_j)
+            (whole_a, T_a_k), (whole_b, T_b_l) = maps_a.whole(near_a), maps_b.whole(near_b)
+            best = align_map(whole_a, whole_b, _between(T_a_k, T_a_b, T_b_l))
             fit = replace(fit, seen_m=best.known_m)
             found_elsewhere = alignments(whole_a, whole_b, best.T_a_b, parallel_headings(whole_a, whole_b))
             for rival in (each for each in found_elsewhere[:RIVALS] if each.score_m > 0.0):
-                T = group.compose(group.compose(T_a_i, group.from_plane(rival.T_a_b)), group.inverse(T_b_j))
+                T = group.compose(group.compose(T_a_k, group.from_plane(rival.T_a_b)), group.inverse(T_b_l))
                 # Two places that look alike may both fit badly; the better one is more likely.
                 found = _fit(maps_a, maps_b, np.broadcast_to(T, b.poses.shape))
                 if found.support > fit.rival_support and found.contradiction <= LARGEST_CONTRADICTION:
@@ -177,15 +174,15 @@ class MapComparison(Kept):
         group, (maps_a, maps_b) = group_of(joint[0]), map(self._maps_of, sessions, own)
         apart_m, found = cKDTree(joint[0][:, : group.axes]).query(joint[1][:, : group.axes])
         nearest, j = np.asarray(found), int(np.argmin(apart_m))
-        if fit is None:
-            T_i_j = group.between(joint[0][nearest], joint[1])
-            fit = _fit(maps_a, maps_b, group.compose(group.compose(own[0][nearest], T_i_j), group.inverse(own[1])))
-        near_a, i, _ = maps_a.around(own[0][nearest[j], : group.axes])
-        near_b, j, _ = maps_b.around(own[1][j, : group.axes])
+        T_i_j = group.between(joint[0][nearest], joint[1])
+        frames = group.compose(group.compose(own[0][nearest], T_i_j), group.inverse(own[1]))
+        fit = _fit(maps_a, maps_b, frames) if fit is None else fit
+        near_a, _, _ = maps_a.around(own[0][nearest[j], : group.axes])
+        near_b, _, _ = maps_b.around(own[1][j, : group.axes])
         if not len(near_a) or not len(near_b):
             return fit
-        T_i_j = _between(joint[0][i], group.identity, joint[1][j])
-        return replace(fit, seen_m=align_map(maps_a.whole(near_a, i), maps_b.whole(near_b, j), T_i_j).known_m)
+        (whole_a, T_a_k), (whole_b, T_b_l) = maps_a.whole(near_a), maps_b.whole(near_b)
+        return replace(fit, seen_m=align_map(whole_a, whole_b, _between(T_a_k, frames[j], T_b_l)).known_m)
 
     def _maps_of(self, session: str, poses: FloatArray) -> SessionMaps:
         """The local maps of a session whose keyscans have these poses (N, P): the kept ones if nothing has changed."""

@@ -43,6 +43,7 @@ class SessionMaps:
         self.numbers, self.poses, self.group = numbers, poses, group_of(poses)
         self._scan, self._in_plane = scan, self.group.to_plane(poses)
         self._built: dict[int, LocalSubmap | None] = {}
+        self._whole: tuple[NDArray[np.int64], Submap, FloatArray] | None = None
 
     @cached_property
     def places(self) -> NDArray[np.int64]:
@@ -61,9 +62,16 @@ class SessionMaps:
         nearest = int(keyscans[np.argmin(distance_m[keyscans])]) if len(keyscans) else -1
         return keyscans, nearest, is_complete
 
-    def whole(self, keyscans: NDArray[np.int64], anchor: int) -> Submap:
-        """The map of keyscans ``around`` a point, in the base of one of them."""
-        return build_submap(self._scans(keyscans, anchor), REACH_M)
+    def whole(self, keyscans: NDArray[np.int64]) -> tuple[Submap, FloatArray]:
+        """The map of keyscans ``around`` a point, in the base of the one in their middle, and the pose (P,) of that.
+
+        Around all points of a short path there are the same keyscans, so the last map is kept.
+        """
+        if self._whole is None or not np.array_equal(keyscans, self._whole[0]):
+            positions = self.poses[keyscans, : self.group.axes]
+            anchor = int(keyscans[np.argmin(np.linalg.norm(positions - positions.mean(axis=0), axis=1))])
+            self._whole = keyscans, build_submap(self._scans(keyscans, anchor), REACH_M), self.poses[anchor]
+        return self._whole[1:]
 
     def at(self, row: int) -> LocalSubmap | None:
         """The local map around a keyscan, in its base; None if too few keyscans are left there."""
