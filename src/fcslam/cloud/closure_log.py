@@ -1,6 +1,7 @@
 """The log of all closures that were considered, with their status and its reason."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from copy import copy
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
@@ -64,13 +65,16 @@ class ClosureLog(Kept):
 
     KEPT: ClassVar = {"_entries": list[ClosureEntry]}
 
-    def __init__(self) -> None:
+    def __init__(self, entries: Iterable[ClosureEntry] = ()) -> None:
+        """Start with copies of the entries of another log, in less time than from its ``state``."""
         self._entries: list[ClosureEntry] = []
         self._between: dict[frozenset[str], list[ClosureEntry]] = {}
         """Entries by pair of robots, because every place queries its pairs."""
         self._at: dict[str, dict[int, list[ClosureEntry]]] = {}
         """Verified entries between robots, by robot and keyscan of each of their two places; a candidate never changes
         its status."""
+        for entry in entries:
+            self._add(copy(entry))
 
     def __iter__(self) -> Iterator[ClosureEntry]:
         return iter(self._entries)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any, Self
 
 from fcslam.cloud.claims import LONGEST_CLOSURE_M, check_constraint, check_submap, with_least_noise
-from fcslam.cloud.closure_log import ClosureEntry
+from fcslam.cloud.closure_log import ClosureEntry, ClosureLog
 from fcslam.cloud.correction_quality import CorrectionQuality
 from fcslam.cloud.decisions import ClosureDecisions
 from fcslam.cloud.edits import floors, is_removed, needs_new_fleet
@@ -197,8 +197,8 @@ class Fleet:
         graph.restore(self._graph.state())
         decisions = ClosureDecisions(self._config, self._sessions, graph, self._space)
         decisions.changes = self._decisions.changes
-        for name in ("closures", "comparison"):
-            getattr(decisions, name).restore(getattr(self._decisions, name).state())
+        decisions.closures = ClosureLog(self._decisions.closures)
+        decisions.comparison.restore(self._decisions.comparison.state())
         decisions.restore(self._decisions.state())
         fusion = decisions.reevaluate(final=True)
         if self._config.fusion is not FusionStrategy.JOINT:
