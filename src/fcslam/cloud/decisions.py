@@ -195,8 +195,7 @@ class ClosureDecisions(Kept):
         if evidence.fit is not None and evidence.fit.seen_m:
             return evidence
         a, b = sorted(pair, key=self._sessions.robots.index)
-        joint, own = ((poses[a], poses[b]) for poses in (fusion.T_map_base, fusion.T_local_base))
-        return replace(evidence, fit=self.comparison.of_join((a, b), joint, own, evidence.fit))
+        return replace(evidence, fit=self.comparison.of_join((a, b), fusion, evidence.fit))
 
     def _mark(self, entry: ClosureEntry) -> bool:
         """Note whether users exclude or pin the closure; returns whether that is new."""

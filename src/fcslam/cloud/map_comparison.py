@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from fcslam.cloud.result import Fusion
 from fcslam.cloud.session_store import SessionStore
 from fcslam.cloud.space import Space
 from fcslam.geometry.groups import group_of
@@ -28,10 +29,6 @@ SESSIONS_KEPT = 10
 """Sessions whose local maps are kept, 4 MB each."""
 RIVALS = 2
 """Transforms elsewhere at which local maps are compared: those with the best scores."""
-
-
-Poses = tuple[FloatArray, FloatArray]
-"""Of the keyscans of two sessions, shape (N, P) each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,23 +159,24 @@ class MapComparison(Kept):
         identity = np.broadcast_to(group_of(poses_b).identity, poses_b.shape)
         return _fit(self._maps_of(sessions[0], poses_a), self._maps_of(sessions[1], poses_b), identity)
 
-    def of_join(self, sessions: tuple[str, str], joint: Poses, own: Poses, fit: MapFit | None) -> MapFit:
+    def of_join(self, sessions: tuple[str, str], fusion: Fusion, fit: MapFit | None) -> MapFit:
         """The fit of two sessions in a joint map with its ``seen_m``, measured around where their paths come nearest.
 
-        The local maps are those at their ``own`` poses, which other comparisons have built. ``fit``: as found before.
+        The local maps are those at the sessions' own poses, which other comparisons have built. ``fit``: if known.
         """
         from scipy.spatial import cKDTree
 
         from fcslam.lidar.uniqueness import align_map
 
-        group, (maps_a, maps_b) = group_of(joint[0]), map(self._maps_of, sessions, own)
-        apart_m, found = cKDTree(joint[0][:, : group.axes]).query(joint[1][:, : group.axes])
-        nearest, j = np.asarray(found), int(np.argmin(apart_m))
-        T_i_j = group.between(joint[0][nearest], joint[1])
-        frames = group.compose(group.compose(own[0][nearest], T_i_j), group.inverse(own[1]))
+        joint_a, joint_b = (fusion.T_map_base[session] for session in sessions)
+        maps_a, maps_b = (self._maps_of(session, fusion.T_local_base[session]) for session in sessions)
+        group, own_a, own_b = maps_a.group, maps_a.poses, maps_b.poses
+        apart_m, found = cKDTree(joint_a[:, : group.axes]).query(joint_b[:, : group.axes])
+        i, j = np.asarray(found), int(np.argmin(apart_m))
+        frames = group.compose(group.compose(own_a[i], group.between(joint_a[i], joint_b)), group.inverse(own_b))
         fit = _fit(maps_a, maps_b, frames) if fit is None else fit
-        near_a, _, _ = maps_a.around(own[0][nearest[j], : group.axes])
-        near_b, _, _ = maps_b.around(own[1][j, : group.axes])
+        near_a, _, _ = maps_a.around(own_a[i[j], : group.axes])
+        near_b, _, _ = maps_b.around(own_b[j, : group.axes])
         if not len(near_a) or not len(near_b):
             return fit
         (whole_a, T_a_k), (whole_b, T_b_l) = maps_a.whole(near_a), maps_b.whole(near_b)

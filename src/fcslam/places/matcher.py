@@ -199,9 +199,6 @@ class PlaceMatcher:
         """Words of the vocabulary; 0 before it is needed."""
         return self._index.word_count
 
-    def __contains__(self, place: KeyscanId) -> bool:
-        return place in self._places
-
     def __iter__(self) -> Iterator[KeyscanId]:
         """Identifiers of the stored places, the oldest first."""
         return iter(self._places)
