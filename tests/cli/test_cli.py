@@ -33,6 +33,12 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"fcslam {__version__}\n"
 
 
+def test_no_command_is_help(capsys):
+    main([])
+    shown = capsys.readouterr()
+    assert "evaluate" in shown.out + shown.err
+
+
 def test_config_dump_of_a_preset_is_a_configuration_file(capsys, tmp_path):
     file = tmp_path / "paper.yaml"
     assert main(["tools", "config", "paper"]) == 0

@@ -28,6 +28,11 @@ def run(tmp_path):
     return tmp_path / "run"
 
 
+def test_a_damaged_run_is_told_in_one_line(run, refused):
+    (run / "closures.csv").write_text("damaged")
+    assert "damaged run folder" in refused("show", run)
+
+
 def test_a_huge_run_is_refused_before_it_is_read(run, refused):
     with (run / "map.pgm").open("ab") as file:
         file.truncate(LARGEST_BYTES + 1)  # without a block on the disk
