@@ -115,6 +115,7 @@ def test_the_preset_of_the_paper_goes_under_the_configuration_file(tmp_path, log
     fleet = yaml.safe_load((run / "config.yaml").read_text())["fleet"]
     assert (fleet["matcher"]["decision"], fleet["matcher"]["delta"]) == ("similarity", 1.5)
     assert (fleet["fusion"], fleet["matcher"]["vocabulary"]["strategy"]) == ("two_point", "windowed")
+    assert not (run / "quality.json").exists(), "no graph says how accurate a rigid map is"
     file.write_text("fleet: {fusion: joint}")
     line = refused("map", log, "--config", "paper", "--config", file, "--output", tmp_path / "other")
     assert f"{file}: fleet: matcher.decision similarity measures no transform" in line

@@ -18,7 +18,7 @@ from fcslam.cloud.edits import in_force
 from fcslam.cloud.report import Track, fuse_members, keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of
-from fcslam.cloud.settings import CloudConfig, FleetConfig
+from fcslam.cloud.settings import CloudConfig, FleetConfig, FusionStrategy
 from fcslam.config import Settings, dump
 from fcslam.errors import FcslamError, InputError, PacketError, SourceError
 from fcslam.lidar.occupancy import OccupancyConfig
@@ -177,7 +177,15 @@ class MissionCloud:
         metrics = (*counts, *traffic_metrics(self._traffic, tracks))
         mission = mission_bytes(self.config.cloud, self.host.edits, self._packets, self._refused, tracks)
         placed, files = self._placed(result)
-        run = run_of(placed, tracks, metrics, dump(self.config), self.config.map, measured=result.graph)
+        run = run_of(
+            placed,
+            tracks,
+            metrics,
+            dump(self.config),
+            self.config.map,
+            with_certificates=self.config.fleet.fusion is FusionStrategy.JOINT,  # rigid maps do not solve the graph
+            measured=result.graph,
+        )
         run = replace(run, map_files={**run.map_files, **files})
         return replace(run, mission=mission)
 

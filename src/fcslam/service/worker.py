@@ -37,7 +37,7 @@ from fcslam.cloud.replies import SessionCorrection
 from fcslam.cloud.report import TURNS, keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch, session_name
-from fcslam.cloud.settings import CloudConfig
+from fcslam.cloud.settings import CloudConfig, FusionStrategy
 from fcslam.cluster.verifying import verifying
 from fcslam.config import dump
 from fcslam.errors import InputError, PacketError, StoreError
@@ -491,7 +491,7 @@ class Worker:
             dump(self._config),
             self._config.map,
             with_local_maps=with_local_maps,
-            with_certificates=with_certificates,
+            with_certificates=with_certificates and self._config.fleet.fusion is FusionStrategy.JOINT,
         )
 
 
