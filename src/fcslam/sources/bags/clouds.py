@@ -81,7 +81,7 @@ def cloud_of(
 
 
 def measured_cloud(stamp: float, frame: str, points: FloatArray, times: Any, longest_s: float) -> PointCloud:
-    """The cloud of the points that are returns, with their times as they are sent; None: there are none."""
+    """The cloud of the points that are returns, with their ``times`` as they are sent; None: it has none."""
     measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
     cloud = PointCloud(stamp, frame, points[measured], np.empty(0))
     return cloud if times is None else _timed(cloud, times[measured], longest_s)
