@@ -21,7 +21,7 @@ from pathlib import Path
 
 import common
 import numpy as np
-from simulated_fleet import CASES, ROBOTS, SEEDS, read
+from simulated_fleet import ROBOTS, SEEDS, read, recorded
 
 from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector
 from fcslam.metrics.bootstrap import mean_interval
@@ -86,12 +86,6 @@ def main() -> None:
     report.table("Summary", SUMMARY, summary(outcomes, chosen.cases, tuple(detectors)))
     report.table("Fleets", COLUMNS, [outcome.row for outcome in outcomes])
     report.write()
-
-
-def recorded(case: str, seed: int, folder: Path) -> Path:
-    """The recordings of one fleet; what is there already is not made again."""
-    fleet, (simulated, _) = folder / f"{case.replace(',', '').replace(' ', '-')}-{seed}", CASES[case]
-    return common.simulated(fleet, "--robots", ROBOTS, "--seed", seed, *simulated)
 
 
 def settings(weights: Sequence[Path], folder: Path) -> dict[str, Path]:

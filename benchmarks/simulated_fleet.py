@@ -52,12 +52,14 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, help="of the fleets")
     parser.add_argument("--jobs", type=int, default=1, help="fleets at the same time; more spoil the times")
     parser.add_argument("--keep", type=Path, help="file that keeps finished fleets; the same one resumes")
+    parser.add_argument("--fleets", type=Path, help="folder that keeps the recordings [they go]")
     chosen = parser.parse_args()
     kept = common.Kept(chosen.keep)
     report = common.Report(__file__, __doc__, chosen)
     fleets = [(case, seed) for case in chosen.cases for seed in chosen.seeds]
-    with ThreadPoolExecutor(chosen.jobs) as pool:
-        done = pool.map(lambda fleet: kept.rows(fleet, lambda: fleet_rows(*fleet)), fleets)
+    with ThreadPoolExecutor(chosen.jobs) as pool, tempfile.TemporaryDirectory() as place:
+        folder = chosen.fleets or Path(place)
+        done = pool.map(lambda fleet: kept.rows(fleet, lambda: fleet_rows(*fleet, folder)), fleets)
         rows = [row for some in done for row in some]
     report.table("Summary", SUMMARY, summary(rows, chosen.cases))
     report.table("Fleets", COLUMNS, rows)
@@ -66,12 +68,16 @@ def main() -> None:
         sys.exit("a fleet did not pass")
 
 
-def fleet_rows(case: str, seed: int) -> Iterable[tuple]:
+def recorded(case: str, seed: int, folder: Path) -> Path:
+    """The recordings of one fleet; what is there already is not made again."""
+    fleet, (simulated, _) = folder / f"{case.replace(',', '').replace(' ', '-')}-{seed}", CASES[case]
+    return common.simulated(fleet, "--robots", ROBOTS, "--seed", seed, *simulated)
+
+
+def fleet_rows(case: str, seed: int, folder: Path) -> Iterable[tuple]:
     """One recorded fleet, mapped with each choice of channels."""
-    simulated, places = CASES[case]
+    fleet, (_, places) = recorded(case, seed, folder), CASES[case]
     with tempfile.TemporaryDirectory() as place:
-        fleet = Path(place) / "fleet"
-        common.run_fcslam("tools", "simulate", "--robots", ROBOTS, "--seed", seed, *simulated, "--output", fleet)
         for name in places:
             settings, run, result = Path(place) / f"{name}.yaml", Path(place) / name, Path(place) / f"{name}.json"
             settings.write_text(f"robot: {{channels: [{', '.join(CHANNELS[name])}]}}\n", encoding="utf-8")
