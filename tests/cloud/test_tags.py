@@ -9,7 +9,7 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
-from fcslam.cloud.tags import MOST_CLOSURES, MOST_TAGS
+from fcslam.cloud.tags import MOST_CLOSURES
 from fcslam.errors import PacketError
 from fcslam.geometry import se2
 from fcslam.records import (
@@ -26,6 +26,7 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.storage.state_file import read_state, write_state
+from fcslam.wire.limits import MAXIMUM_TAGS
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import measure
 from fcslam.wire.quantisation import dequantise, quantise
@@ -146,12 +147,26 @@ def test_many_sessions_of_one_robot_hide_a_tag_from_nobody():
 
 
 def test_tags_and_their_closures_are_limited():
-    many = [(Tag(TAG.family, number), AT, 9) for number in range(MOST_TAGS + 1)]
+    many = [(Tag(TAG.family, number), AT, 9) for number in range(MAXIMUM_TAGS + 1)]
     with pytest.raises(PacketError, match="saw more than 32 tags"):
         concluded(drive("anna", SOUTH, many))
     often = [(tag, AT, len(LOOP)) for tag, _, _ in many[:20]]
     result = concluded([*drive("anna", LOOP, often), *drive("berta", LOOP, often)])
     assert sum(closure.i.robot != closure.j.robot for closure in result.closures) == MOST_CLOSURES
+
+
+def test_a_refused_sighting_changes_nothing():
+    full = [(Tag(TAG.family, number), AT, 1) for number in range(MAXIMUM_TAGS)]
+    packets = drive("anna", SOUTH, full)
+    fleet = Fleet(FleetConfig(), 0)
+    for packet in packets:
+        fleet.apply(packet)
+    before = repr(fleet.state()["tags"])
+    sighting = packets[-1].body
+    for tag, reason in ((TAG, "saw tag"), (TAG._replace(number=99), "saw more than")):
+        with pytest.raises(PacketError, match=reason):
+            fleet.apply(replace(packets[-1], sequence=len(packets), body=replace(sighting, tag=tag)))
+        assert repr(fleet.state()["tags"]) == before
 
 
 def test_the_result_does_not_depend_on_the_order_of_arrival():

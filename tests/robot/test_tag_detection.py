@@ -11,9 +11,12 @@ from fcslam.config import parse
 from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.simulation.simulated_fleet import CameraSettings
-from fcslam.records import CameraImage, KeyscanId, TagFamily
+from fcslam.lidar.frontend import ScanPose
+from fcslam.records import CameraImage, Channel, KeyscanId, LaserModel, LaserScan, Tag, TagFamily, TagSighting
+from fcslam.robot.backend import NewImage, RobotBackend, SessionConfig
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.tag_detection import TagDetector, TagsConfig
+from fcslam.wire.limits import MAXIMUM_TAGS
 
 pytestmark = pytest.mark.slow
 
@@ -81,6 +84,25 @@ def test_aruco_tags_are_read():
     tag = replace(TAG, family=TagFamily("6x6_250"), number=240)
     (one,) = seen(robot_at(1.2, 0.7, 0.0), (tag,), family=tag.family)
     assert one.tag == (TagFamily("6x6_250"), 240)
+
+
+def test_a_keyscan_near_a_board_of_many_tags_sends_as_many_as_the_cloud_takes(monkeypatch):
+    numbers = iter((range(20), range(10, 36), range(36)))
+
+    def find(_detector, _image, keyscan, T_keyscan_image):
+        for number in next(numbers):
+            yield TagSighting(keyscan, Tag(TagFamily.APRILTAG_36H11, number), T_keyscan_image, np.eye(3))
+
+    monkeypatch.setattr(TagDetector, "find", find)
+    backend = RobotBackend("anna", SessionConfig(channels=(Channel.LIDAR,), tags=TagsConfig(size_m=0.1)))
+    laser = LaserModel(4, 0.0, 1.0, 10.0)
+    scan = LaserScan(0.0, np.zeros(4, np.float32), laser, np.zeros(3))
+    image = CameraImage(0.0, b"", CAMERA, None)
+    sent = [
+        [one.tag.number for one in backend.process(NewImage(image, scan, ScanPose(0.0, keyscan, np.zeros(3)), (scan,)))]
+        for keyscan in (0, 0, 1)
+    ]
+    assert sent == [list(range(20)), list(range(20, MAXIMUM_TAGS)), list(range(MAXIMUM_TAGS))]
 
 
 @pytest.mark.parametrize(

@@ -34,11 +34,10 @@ from fcslam.records import (
 )
 from fcslam.storage.snapshot import Kept
 from fcslam.storage.state_file import State
+from fcslam.wire.limits import MAXIMUM_TAGS
 
 MOST_SENDERS = 10
 """Robots, those that saw the tag last, whose newest session a new sighting is paired with."""
-MOST_TAGS = 32
-"""Tags that one keyscan sees at most."""
 MOST_CLOSURES = 200
 """Closures by tags between two sessions: their cost grows with the square."""
 REVISIT_M = 10.0
@@ -69,12 +68,12 @@ class SeenTags(Kept):
         self._sessions.require(sighting.id)
         check_sighting(sighting)
         session, number = sighting.id
+        if number in self._seen.get(sighting.tag, {}).get(session, {}):
+            raise PacketError(f"{session}: keyscan {number} saw tag {sighting.tag} before")
+        if self._tags[sighting.id] >= MAXIMUM_TAGS:
+            raise PacketError(f"{session}: keyscan {number} saw more than {MAXIMUM_TAGS} tags")
         seen = self._seen.setdefault(sighting.tag, {})
         own = seen.setdefault(session, {})
-        if number in own:
-            raise PacketError(f"{session}: keyscan {number} saw tag {sighting.tag} before")
-        if self._tags[sighting.id] >= MOST_TAGS:
-            raise PacketError(f"{session}: keyscan {number} saw more than {MOST_TAGS} tags")
         newest: dict[str, str] = {}
         for name in reversed(seen):
             if name != session and self._sessions.floor(name) == self._sessions.floor(session):

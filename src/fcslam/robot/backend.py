@@ -4,6 +4,7 @@ It builds submaps, closes loops, solves the pose graph and describes places. Its
 their order, so it gives the same records wherever and whenever it runs (``fcslam.robot.backend_runner``).
 """
 
+from collections import defaultdict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum, auto
@@ -44,6 +45,7 @@ from fcslam.records import (
 from fcslam.robot.keyframe_folder import KeyframeFolder
 from fcslam.robot.tag_detection import TagDetector, TagsConfig
 from fcslam.robot.views import ViewExtractor, ViewsConfig
+from fcslam.wire.limits import MAXIMUM_TAGS
 from fcslam.wire.messages import Body, Hello
 
 
@@ -195,8 +197,8 @@ class _Session:
         self._described: set[tuple[int, str]] = set()
         """Keyscan and detector version of every camera place that was sent."""
         self._tag_detector = None if config.tags.size_m is None else TagDetector(config.tags)
-        self._sighted: set[tuple[int, Tag]] = set()
-        """Keyscan and tag of every sighting that was sent."""
+        self._sighted: defaultdict[int, set[Tag]] = defaultdict(set)
+        """The tags whose sightings were sent, by keyscan."""
         self._announced: Hello | None = None
 
     def add(self, input: NewKeyscan) -> list[Body]:
@@ -219,9 +221,10 @@ class _Session:
         T_scan_image = np.zeros(3) if odometry is None else se2.between(scan.T_odom_base, odometry)
         T_keyscan_image = se2.compose(pose.T_keyscan_base, T_scan_image)
         keyscan = KeyscanId(self._robot, pose.keyscan)
+        sent = self._sighted[pose.keyscan]
         for sighting in self._tag_detector.find(input.image, keyscan, T_keyscan_image):
-            if (pose.keyscan, sighting.tag) not in self._sighted:
-                self._sighted.add((pose.keyscan, sighting.tag))
+            if sighting.tag not in sent and len(sent) < MAXIMUM_TAGS:
+                sent.add(sighting.tag)
                 yield sighting
 
     def finish(self) -> list[Body]:

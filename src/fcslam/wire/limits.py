@@ -16,6 +16,8 @@ MAXIMUM_EPOCH = 2**31 - 1
 MAXIMUM_LASERS = 8
 """Lasers of one robot."""
 MAXIMUM_BEAMS = 4096
+MAXIMUM_TAGS = 32
+"""Tags that one keyscan sees."""
 BYTES_PER_RANGE = 2
 
 MAXIMUM_KEYPOINTS = 2048
