@@ -79,13 +79,14 @@ class MapComparison(Kept):
 
         The closures from a to b, at least one, give the transform. Returns None if a session has no keyscan left around
         the places. An earlier comparison at the same transform counts until the cluster or the paths have grown by a
-        factor, if the maps agreed clearly until the paths have, and for good if keyscans were released since.
+        factor, if the maps agreed clearly until the paths have, and for good if keyscans were released since. One that
+        did not look elsewhere counts only while it may not decide.
         """
         pair, size, T_a_b = frozenset(sessions), len(a) + len(b), relative_frame(a, b, members)
         kept = self._compared.get(pair, [])
         same = [each for each in kept if self._is_at(each, a, b, T_a_b)]
-        earlier = same[0] if same else None
-        if earlier is not None and (earlier.is_searched or not may_decide(earlier.fit)):
+        earlier = same[0] if same and (same[0].is_searched or not may_decide(same[0].fit)) else None
+        if earlier is not None:
             is_clear = earlier.agrees and earlier.fit.ratio >= LEAD
             has_grown = size > growth * earlier.size or len(members) > growth * earlier.closures
             if size <= growth * growth * earlier.size if is_clear else not has_grown:
