@@ -55,8 +55,10 @@ def opened(tmp_path, messages, options=IN_3D):
     return source
 
 
-def test_clouds_carry_the_readings_of_wheels_and_imu_up_to_their_end(tmp_path):
-    source = opened(tmp_path, drive())
+@pytest.mark.parametrize("layout", [VELODYNE, (12, xyz()), timed(lambda measured: 0.1 * measured.times)])
+def test_clouds_carry_the_readings_of_wheels_and_imu_up_to_their_end(tmp_path, layout):
+    early = [m._replace(bag_time=m.bag_time - 0.1 * (m.topic == "/points")) for m in drive(layout)]
+    source = opened(tmp_path, early)
     scans = list(source.records())
     survey = source.survey()
     assert survey.scan_count == len(scans) == 14

@@ -91,16 +91,17 @@ class CloudReader:
     body_radius_m: float
     """Points nearer to the vertical through ``base`` are of the robot itself."""
 
+    def times_s(self, cloud: PointCloud) -> NDArray[np.float64]:
+        """When each point was measured after the stamp, shape (N,)."""
+        if self.is_timed and len(cloud.times_s):
+            return cloud.times_s
+        return np.linspace(0.0, self.period_s, len(cloud.points), endpoint=False)
+
     def scan(self, cloud: PointCloud, wheels: FloatArray, imu: FloatArray) -> CloudScan:
         """The record of a cloud with the readings since the previous one; raises ValueError if it has few points."""
         if len(cloud.points) < _FEWEST_POINTS:
             raise ValueError(f"{len(cloud.points)} points are not a turn of a 3D LiDAR")
-        points = self.mounting.in_base(cloud)
-        times: NDArray[np.float64] = np.zeros(len(points))
-        if self.is_timed and len(cloud.times_s):
-            times = cloud.times_s
-        elif self.period_s > 0.0:
-            times = np.linspace(0.0, self.period_s, len(points), endpoint=False)
+        points, times = self.mounting.in_base(cloud), self.times_s(cloud)
         outside = np.hypot(points[:, 0], points[:, 1]) > self.body_radius_m
         return CloudScan(
             cloud.stamp,
@@ -147,7 +148,7 @@ def reader_of(
                 f"{where}: the times of the points contradict how the LiDAR turns; their order gives them: correct the "
                 "unit of the times in the driver"
             )
-    period_s = period_s if is_in_order else 0.0
+    period_s = max(period_s, 0.0) if is_in_order else 0.0
     if not mounting.is_height_known:
         mounting = _on_floor(first, mounting) or mounting._replace(is_height_known=True)
     flipped = mounting._replace(rotation=np.diag([1.0, -1.0, -1.0]) @ mounting.rotation)

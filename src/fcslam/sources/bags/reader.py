@@ -194,7 +194,8 @@ class CloudStream:
         """``audit`` counts the faults."""
         self._reader, self._audit = reader, audit
         self._wheels, self._imu = _Readings(4), _Readings(7)
-        self._waiting: deque[tuple[int, PointCloud]] = deque()
+        self._waiting: deque[tuple[int, PointCloud, float]] = deque()
+        """Clouds with the numbers of their messages and the times of their last points."""
         self._newest_s = -np.inf
 
     def add(self, number: int, item: Item) -> Iterator[tuple[int, CloudScan]]:
@@ -207,8 +208,9 @@ class CloudStream:
             self._audit.add(Fault.REPEATED_STAMP, number)
         elif isinstance(item, PointCloud):
             self._newest_s = item.stamp
-            self._waiting.append((number, item))
-        while self._waiting and (len(self._waiting) > _MOST_CLOUDS or self._is_covered(self._waiting[0][1])):
+            end_s = item.stamp + float(self._reader.times_s(item).max(initial=0.0))
+            self._waiting.append((number, item, end_s))
+        while self._waiting and (len(self._waiting) > _MOST_CLOUDS or self._is_covered(self._waiting[0][2])):
             yield from self._next()
 
     @property
@@ -227,12 +229,11 @@ class CloudStream:
 
     finish = skip_odometry
 
-    def _is_covered(self, cloud: PointCloud) -> bool:
-        end_s = cloud.stamp + float(cloud.times_s.max(initial=0.0))
+    def _is_covered(self, end_s: float) -> bool:
         return all(each.newest_s >= end_s or not np.isfinite(each.newest_s) for each in (self._wheels, self._imu))
 
     def _next(self) -> Iterator[tuple[int, CloudScan]]:
-        number, cloud = self._waiting.popleft()
+        number, cloud, _ = self._waiting.popleft()
         try:
             yield number, self._reader.scan(cloud, self._wheels.take(), self._imu.take())
         except ValueError:
