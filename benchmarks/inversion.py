@@ -15,10 +15,10 @@ true image is, of all targets of its kind, the one whose picture of 32 x 24 pixe
 reconstruction; chance is one in so many.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import common
 import cv2
@@ -26,9 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fcslam.features.classical import make_detector
-from fcslam.features.detector import FeatureDetector, OnnxConfig
+from fcslam.features.detector import FeatureDetector, GreyImage, OnnxConfig, decode_grey
 from fcslam.learning.images import find_images, read_image
 from fcslam.mission.mission import MissionConfig
+from fcslam.records import CameraImage
+from fcslam.sources import open_source
 
 SIZE = (320, 240)
 HALF = 24
@@ -41,6 +43,7 @@ COLUMNS = {"targets": "", "attack": "", "images": "", "keypoints": ".0f", "cover
            "SSIM": ".3f", "PSNR in patches": ".2f", "SSIM in patches": ".3f", "recognised": ".0%",
            "chance": ".0%"}  # fmt: skip
 
+T = TypeVar("T")
 Image = NDArray[np.float32]
 Inverter = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """Bits as +1 and -1 (N, 256) to patches (N, 48, 48)."""
@@ -66,12 +69,12 @@ def main() -> None:
     report = common.Report(__file__, __doc__, chosen)
     views = MissionConfig().robot.views
     detector = make_detector(views.detector, OnnxConfig(weights=views.weights))
-    known = [seen for name in PHOTOGRAPHS for seen in look([folder / name], chosen.photographs, detector)]
+    known = [seen for name in PHOTOGRAPHS for seen in look(pictures([folder / name], chosen.photographs), detector)]
     grey = float(np.mean([seen.image.mean() for seen in known]))
     attacks = {"nearest code": nearest_code(known), "regression": regression(known)}
     targets = {
-        "IE tower": list(look([folder / "ie_tower" / floor for floor in FLOORS], chosen.targets, detector)),
-        "simulated": list(look(sorted(chosen.fleet.glob("robot_*/images")), chosen.targets, detector)),
+        "IE tower": list(look(pictures([folder / "ie_tower" / floor for floor in FLOORS], chosen.targets), detector)),
+        "simulated": list(look(seen_by(sorted(chosen.fleet.glob("robot_*")), chosen.targets), detector)),
     }
     rows = []
     for name, seen in targets.items():
@@ -90,14 +93,28 @@ def main() -> None:
     report.write()
 
 
-def look(folders: Sequence[Path], most: int, detector: FeatureDetector) -> Iterator[Seen]:
-    """Evenly spread images of all folders together, as a robot's camera gives them, with what is detected in them."""
-    files = [file for folder in folders for file in find_images([folder])]
-    for file in files[:: max(1, len(files) // most)][:most]:
-        picture = read_image(file.path)
-        if picture is None:
+def pictures(folders: Sequence[Path], most: int) -> Iterator[GreyImage | None]:
+    """Evenly spread images of all folders together."""
+    return (read_image(file.path) for file in spread(find_images(folders), most))
+
+
+def seen_by(robots: Sequence[Path], most: int) -> Iterator[GreyImage | None]:
+    """Evenly spread images of all recordings together."""
+    records = (record for robot in robots for record in open_source(robot).records())
+    images = [record.encoded for record in records if isinstance(record, CameraImage)]
+    return map(decode_grey, spread(images, most))
+
+
+def spread(values: Sequence[T], most: int) -> Sequence[T]:
+    return values[:: max(1, len(values) // most)][:most]
+
+
+def look(images: Iterable[GreyImage | None], detector: FeatureDetector) -> Iterator[Seen]:
+    """Images as a robot's camera gives them, with what is detected in them."""
+    for image in images:
+        if image is None:
             continue
-        picture = np.asarray(cv2.resize(picture, SIZE, interpolation=cv2.INTER_AREA), np.uint8)
+        picture = np.asarray(cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA), np.uint8)
         features = detector.detect(picture)
         if len(features.descriptors):
             signs = 2.0 * np.unpackbits(features.descriptors, axis=1).astype(np.float32) - 1.0
