@@ -8,8 +8,9 @@ import pytest
 from fcslam.geometry import se3
 from fcslam.geometry.voxels import VOXEL_STEPS, voxelised
 from fcslam.lidar3d.ground import Vertical, levelled
+from fcslam.lidar3d.local_maps import Keyframes
 from fcslam.lidar3d.surfels import POINT_SIGMA_M, SurfelMap
-from fcslam.lidar3d.tracker import Tracker3d, without_noise
+from fcslam.lidar3d.tracker import Tracked, Tracker3d, without_noise
 from fcslam.records import STEP_M
 from fcslam.sources.clouds_in_space import FEWEST_ON_FLOOR, floor_at
 from tests.spinning_lidar import PERIOD_S, circle, drive, room
@@ -65,6 +66,52 @@ def test_up_is_that_of_most_floors_though_a_robot_starts_on_a_ramp() -> None:
     for _ in range(7):
         vertical.add(ramp)
     assert vertical.up @ level < 0.995, "most of the drive was on the ramp"
+
+
+def circles(t: float) -> np.ndarray:
+    """Position and heading of a robot that speeds up to 1 m/s and drives on along a circle of 1.5 m."""
+    way = 0.25 * t**2 if t < 2.0 else t - 1.0
+    return np.array([1.5 * np.cos(way / 1.5), 1.5 * np.sin(way / 1.5), way / 1.5 + np.pi / 2])
+
+
+def stop_and_go(t: float) -> np.ndarray:
+    """The same of one that speeds up within 1 s to 1 m/s, drives, brakes, and stands for 2 s, again and again."""
+    laps, s = divmod(t, 6.0)
+    return np.array([2.0 * laps + np.interp(s, np.linspace(0.0, 4.0, 41), np.cumsum(SPEEDS) / 10.0), 0.0, 0.0])
+
+
+SPEEDS = np.concatenate((np.arange(0.05, 1.0, 0.1), np.ones(20), np.arange(0.95, 0.0, -0.1), np.zeros(1)))
+LEVEL, FLOOR = np.array([0.0, 0.0, 1.0]), np.random.default_rng(8).uniform((-3.0, -3.0, 0.0), (3.0, 3.0, 0.0), (400, 3))
+
+
+def lean_deg(
+    drive_at: object, floor: np.ndarray, pitch_rad: float = 0.0, bias: float = 0.0, unit: float = 1.0
+) -> float:
+    """How far ``up`` leans after 25 s with an IMU, on a slope of ``pitch_rad`` whose ``floor`` the robot sees."""
+    keyframes, uphill = Keyframes(), se3.exp(np.array([0.0, 0.0, 0.0, 0.0, pitch_rad, 0.0]))
+    stamps = np.arange(250) * 0.1
+    poses = se3.compose(uphill, se3.from_plane(np.array([drive_at(t) for t in stamps])))  # type: ignore[operator]
+    accelerations = np.diff(poses[:, :3], 2, axis=0, prepend=poses[[0, 0], :3]) / 0.01 + 9.81 * LEVEL
+    forces = unit * (np.einsum("nij,ni->nj", se3.rotation(poses), accelerations) + np.array([0.0, bias, 0.0]))
+    found = se3.compose(poses, se3.exp(np.random.default_rng(0).normal(0.0, 0.002, (250, 6))))
+    motions = se3.between(poses[[0, *range(249)]], poses)
+    for t, pose, motion, force in zip(stamps, found, motions, forces, strict=True):
+        keyframes.add(Tracked(t, pose, floor, np.zeros(3), np.eye(6), motion, np.ones(6), False), force)
+    return float(np.degrees(np.arccos(min(1.0, keyframes.vertical.up @ LEVEL))))
+
+
+@pytest.mark.parametrize("drive_at", [circles, stop_and_go])
+@pytest.mark.parametrize("unit", [1.0, 1.0 / 9.81])
+def test_up_is_against_gravity_however_the_robot_drives(drive_at: object, unit: float) -> None:
+    assert lean_deg(drive_at, FLOOR[:0], unit=unit) < 0.5
+    assert lean_deg(drive_at, FLOOR[:0], pitch_rad=0.12, unit=unit) < 0.5
+
+
+@pytest.mark.parametrize("drive_at", [circles, stop_and_go])
+def test_up_is_that_of_the_floor_though_the_imu_leans_and_gravity_knows_ramps(drive_at: object) -> None:
+    assert lean_deg(drive_at, FLOOR, bias=0.3) < 0.1
+    assert lean_deg(drive_at, FLOOR, pitch_rad=0.12) < 0.5
+    assert lean_deg(drive_at, FLOOR, unit=0.0) < 0.1, "an IMU that leaves gravity out says nothing"
 
 
 def one_plane(seed: int, count: int = 400) -> tuple[SurfelMap, np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """Where the floor is around a robot with a 3D LiDAR, and what a 2D laser above it would see.
 
-The floor is where wheels stand: it follows the robot over ramps. Up is the direction of gravity. Without an IMU, it is
-the normal of most floors, so that a ramp does not count.
+The floor is where wheels stand: it follows the robot over ramps. Up is the normal of most floors, so that a ramp does
+not count. An IMU says which floors are level, and gives up where no floor is seen.
 """
 
 from math import cos, radians
@@ -16,6 +16,8 @@ from fcslam.sources.point_clouds import CloudBand
 
 _SAME_FLOOR: Final = cos(radians(3.0))
 """Floors that lean by less against the vertical are level."""
+_GRAVITY, _FORCE_SHARE = 9.81, 0.1
+"""Specific force at rest, m/s^2 (some IMUs state multiples of it), and the largest share by which it may be wrong."""
 _RATE: Final = 0.02
 """Least share of a new measurement in the vertical."""
 _BAND: Final = CloudBand(low_m=0.2)
@@ -33,9 +35,43 @@ class Vertical:
         self.up = np.array([0.0, 0.0, 1.0])
         self._found: list[tuple[FloatArray, int]] = []
         """Directions that differ, and how often each was measured."""
+        self._stamp, self._position = np.nan, np.zeros(3)
+        """Of the newest turn."""
+        self._felt_s, self._impulse = 0.0, np.zeros(3)
+        """Time since the newest keyframe, and the integral of the specific force over it."""
+        self._velocity, self._velocity_before = np.full(3, np.nan), np.full(3, np.nan)
+        """At the newest turn, and at the newest keyframe."""
+
+    def feel(self, stamp: float, T_odom_base: FloatArray, force: FloatArray | None) -> None:
+        """Take the next turn with the mean specific force (3,) in ``base`` since the one before; None without an
+        IMU."""
+        elapsed_s = stamp - self._stamp
+        if elapsed_s > 0.0:
+            self._velocity = (T_odom_base[:3] - self._position) / elapsed_s
+            self._felt_s += elapsed_s
+            self._impulse += elapsed_s * (np.nan if force is None else se3.rotation(T_odom_base) @ force)
+        self._stamp, self._position = stamp, T_odom_base[:3]
+
+    def take(self, floor: FloatArray | None) -> None:
+        """The newest turn is a keyframe, which sees a floor with this normal (3,) in ``odom``, or none."""
+        gravity = self._gravity()
+        if floor is not None and (gravity is None or floor @ gravity > _SAME_FLOOR):
+            self.add(floor)
+        elif gravity is not None:
+            self.add(gravity)
+
+    def _gravity(self) -> FloatArray | None:
+        """Direction of the specific force since the keyframe before, without the part that changed the velocity."""
+        felt, changed = self._impulse / max(self._felt_s, 1e-9), self._velocity - self._velocity_before
+        changed /= max(self._felt_s, 1e-9)
+        self._felt_s, self._impulse, self._velocity_before = 0.0, np.zeros(3), self._velocity
+        unit = 1.0 if np.linalg.norm(felt) > np.sqrt(_GRAVITY) else _GRAVITY
+        gravity = unit * felt - changed
+        strength = np.linalg.norm(gravity)
+        return gravity / strength if abs(strength - _GRAVITY) < _FORCE_SHARE * _GRAVITY else None
 
     def add(self, direction: FloatArray) -> None:
-        """Take a measured direction (3,): of a floor, or of the specific force at rest."""
+        """Take a measured direction (3,): of a floor, or of gravity."""
         direction = direction / np.linalg.norm(direction)
         near = [float(direction @ mean) for mean, _ in self._found]
         if not near or max(near) < _SAME_FLOOR:

@@ -70,13 +70,15 @@ class Keyframes:
         """Covariance of the pose relative to the newest keyframe."""
 
     def add(self, tracked: Tracked, force: FloatArray | None) -> tuple[MappedTurn | None, KeyframeMotion | None]:
-        """The turn as a keyframe, with the motion from the one before, or None; ``force`` is that of the IMU."""
+        """The turn as a keyframe, with the motion from the one before, or None; ``force`` is that of the IMU
+        since the turn before."""
+        self.vertical.feel(tracked.stamp, tracked.T_odom_base, force)
         back = se3.adjoint(se3.inverse(tracked.motion))
         predicted = back @ self.covariance @ back.T + np.diag(tracked.motion_sigma**2)
         information = inverse(predicted) + tracked.measured
         self.covariance = inverse(information)
         if self.newest is None:
-            return self._keyframe(tracked, 0, 0.0, force), None
+            return self._keyframe(tracked, 0, 0.0), None
         T = se3.between(self.newest.T_odom_base, tracked.T_odom_base)
         tangent = se3.log(T)
         if tracked.is_poor or (np.linalg.norm(tangent[:3]) < _STEP_M and np.linalg.norm(tangent[3:]) < _STEP_RAD):
@@ -89,15 +91,11 @@ class Keyframes:
         )
         travel_m = self.newest.travel_m + float(np.linalg.norm(T[:3]))
         self.covariance = np.zeros((6, 6))
-        return self._keyframe(tracked, motion.j, travel_m, force), motion
+        return self._keyframe(tracked, motion.j, travel_m), motion
 
-    def _keyframe(self, tracked: Tracked, number: int, travel_m: float, force: FloatArray | None) -> MappedTurn:
+    def _keyframe(self, tracked: Tracked, number: int, travel_m: float) -> MappedTurn:
         floor = floor_at(tracked.points)
-        rotation = se3.rotation(tracked.T_odom_base)
-        if floor is not None and (number == 0 or force is None):
-            self.vertical.add(rotation @ floor[0])
-        elif force is not None:
-            self.vertical.add(rotation @ force)
+        self.vertical.take(None if floor is None else se3.rotation(tracked.T_odom_base) @ floor[0])
         self.newest = MappedTurn(
             number,
             tracked.T_odom_base,

@@ -10,7 +10,7 @@ import numpy as np
 
 from fcslam.compiled import njit
 from fcslam.geometry import se2, se3
-from fcslam.lidar.gyro import FEWEST_READINGS, GYRO_NOISE, KEPT_S, GyroBias, covers, integral, newest
+from fcslam.lidar.gyro import GYRO_NOISE, KEPT_S, GyroBias, covers, integral, newest
 from fcslam.lidar.odometry import OdometryModel, OdometryTrust, odometry_error
 from fcslam.records import CloudScan, FloatArray
 
@@ -59,11 +59,6 @@ class MotionSensors:
         """Take the readings that came with a turn."""
         self._wheels = newest(self._wheels, scan.wheels, scan.stamp - KEPT_S)
         self._imu = newest(self._imu, scan.imu, scan.stamp - KEPT_S)
-
-    @property
-    def force(self) -> FloatArray | None:
-        """Mean specific force over the newest readings of the IMU, shape (3,), m/s^2; None without an IMU."""
-        return self._imu[:, 4:].mean(axis=0) if len(self._imu) >= FEWEST_READINGS else None
 
     def predict(self, times: FloatArray) -> Prediction:
         """The motion over ascending ``times`` (K,), seconds."""

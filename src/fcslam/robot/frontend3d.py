@@ -163,7 +163,7 @@ class RobotFrontend3d:
         if not self._poor:
             self._certain_s = scan.stamp
         self.packets.advance(scan.stamp)
-        keyframe, motion = self._keyframes.add(tracked, self._tracker.sensors.force)
+        keyframe, motion = self._keyframes.add(tracked, scan.imu[:, 4:].mean(axis=0) if len(scan.imu) else None)
         newest = self._keyframes.newest
         assert newest is not None  # the first turn of a session is a keyframe
         if keyframe is not None:
