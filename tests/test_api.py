@@ -13,6 +13,8 @@ import pytest
 import fcslam
 from fcslam import api, errors
 from fcslam.sources import open_source
+from tests.sources.test_clouds_in_space import drive as drive_in_space
+from tests.sources.test_clouds_in_space import opened as opened_in_space
 
 ROOT = Path(__file__).parents[1]
 
@@ -54,6 +56,18 @@ def test_names_load_their_modules_at_the_first_use():
         "assert 'fcslam.records' in after and 'fcslam.mission.mission' not in after\n"
     )
     subprocess.run([sys.executable, "-c", program], cwd=ROOT / "src", check=True)
+
+
+def test_what_a_map_in_space_does_not_use_is_named(logs, tmp_path):
+    whole, planar = opened_in_space(tmp_path, drive_in_space()), open_source(logs[0])
+    plain = {"fleet": {"dimensions": 3}}
+    tuned = api.settings_of({**plain, "robot": {"lost": {"doubted": 0.9}}})
+    assert api.notes_in_space([whole], api.settings_of(plain)) == []
+    assert api.notes_in_space([whole], tuned) == ["robot.lost: only robots with 2D LiDARs use these settings"]
+    (note,) = api.notes_in_space([planar], tuned)
+    assert "no point clouds" in note
+    assert len(api.notes_in_space([whole, planar], tuned)) == 2
+    assert api.notes_in_space([whole, planar], api.settings_of({"robot": {"lost": {"doubted": 0.9}}})) == []
 
 
 def test_a_run_that_was_opened_can_be_saved_again(opened, tmp_path):

@@ -93,7 +93,7 @@ def map_recordings(
     options = in_3d(bag_options, settings)
     opened = _opened(recordings, options, settings.robot.lidar, at_least=1 if onto is None else 0)
     robots = split_recordings(opened, split)
-    if settings.fleet.dimensions == 3 and (note := sources.planar_note(opened)):
+    for note in notes_in_space(opened, settings):
         _log.info("%s", note)
     if isinstance(floors, str):
         floors = {robot.name: floors for robot in robots if floors}
@@ -215,6 +215,14 @@ def changes(
 def in_3d(options: BagOptions | None, settings: MissionConfig) -> BagOptions | None:
     """The options with which recordings are read: clouds whole, if poses are in space."""
     return options if settings.fleet.dimensions == 2 else replace(options or BagOptions(), in_3d=True)
+
+
+def notes_in_space(recordings: Sequence[Source], settings: MissionConfig) -> list[str]:
+    """Lines about what a map in space does not use of the recordings and the settings; none in the plane."""
+    if settings.fleet.dimensions == 2:
+        return []
+    unused = settings.robot.unused_in_space if any(map(sources.is_whole, recordings)) else ""
+    return [*filter(None, (sources.planar_note(recordings), unused))]
 
 
 def split_recordings(recordings: list[Source], parts: int) -> list[Source]:

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se3
+from fcslam.live.records import Wiring
+from fcslam.live.robot import Robot
 from fcslam.records import Constraint, ConstraintKind, Keyscan, Place, VoxelMap
 from fcslam.robot.backend import SessionConfig
+from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.frontend3d import RobotFrontend3d
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
+from tests.live.same_thread import SameThread
 from tests.spinning_lidar import circle, drive, room
 
 
@@ -66,6 +70,32 @@ def test_keyscans_show_walls_where_they_are(driven: tuple) -> None:
     near = np.min([np.abs(x), np.abs(x - 12.0), np.abs(y), np.abs(y - 8.0)], axis=0)
     assert seen.mean() > 0.3
     assert np.median(near) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("lidar", "is_left_out"),
+    [
+        ({}, False),
+        ({"footprint": [[-0.7, -0.2], [-0.5, -0.2], [-0.5, 0.2], [-0.7, 0.2]]}, True),
+        ({"ignore": [[170.0, -170.0]]}, True),
+    ],
+)
+def test_the_robot_itself_is_left_out(lidar: dict, is_left_out: bool) -> None:
+    robot = RobotFrontend3d("anna", SessionConfig(lidar=lidar))
+    mast = np.column_stack((np.full(40, -0.6), np.zeros(40), np.linspace(0.2, 1.0, 40))).astype(np.float32)
+    for scan, _ in drive(room(1), circle((6.0, 4.0), 1.6, 0.8), 12, azimuths=120):
+        points, times = np.vstack((scan.points_m, mast)), np.append(scan.times_s, np.zeros(40, np.float32))
+        robot.process(replace(scan, points_m=points, times_s=times))
+    keyframe, _ = robot.mapped
+    assert (np.hypot(keyframe.points[:, 0] + 0.6, keyframe.points[:, 1]) > 0.15).all() == is_left_out
+
+
+def test_settings_without_effect_are_named() -> None:
+    assert not RobotConfig(lidar={"footprint": [[0, 0], [1, 0], [1, 1]]}, channels=["lidar"]).unused_in_space
+    config = {"fleet": {"dimensions": 3}, "robot": {"lidar": {"tracker": "karto"}, "tags": {"size_m": 0.2}}}
+    with Robot("anna", lidar_3d=True, config=config, wiring=Wiring(SameThread())) as robot:
+        (notice,) = robot.status().notices
+    assert notice == "robot.lidar.tracker, robot.tags: only robots with 2D LiDARs use these settings"
 
 
 def test_a_clock_that_steps_back_begins_a_session() -> None:

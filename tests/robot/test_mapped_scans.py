@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.records import LaserModel, LaserScan, frozen
+from fcslam.records import CloudScan, LaserModel, LaserScan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.mapped_scans import MappedScans
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
 from tests.lidar.worlds import ranges, room
@@ -64,6 +65,23 @@ def test_every_kth_beam_is_kept(model, step):
     scan = scan_of(model)
     (announced,), keyscan = mapped(scan)
     assert announced.beam_count == len(keyscan.ranges_m) == len(scan.ranges_m[::step])
+
+
+def test_of_clouds_and_scans_the_same_returns_are_left_out():
+    ignore, footprint = ((20.0, 70.0), (-100.0, -95.5)), ((-1.0, -1.0), (0.5, -1.0), (0.5, 2.5), (-1.0, 2.5))
+    model = replace(laser(360), T_base_laser=(0.2, 0.1, 0.4))
+    scan = replace(scan_of(model), ranges_m=frozen(np.linspace(0.3, 4.0, 360), np.float32))
+    angles = model.T_base_laser[2] + model.angles_rad()
+    ends = np.column_stack((np.cos(angles), np.sin(angles))) * scan.ranges_m[:, None] + model.T_base_laser[:2]
+    points = frozen(np.column_stack((ends, np.full(360, 0.7))), np.float32)
+    times, origin = frozen(np.linspace(0.0, 0.1, 360), np.float32), frozen(np.array((0.2, 0.1, 0.5)))
+    cloud = CloudScan(0.0, points, times, origin, np.zeros((0, 4)), np.zeros((0, 7)))
+    for mapped_scans in (MappedScans(ignore), MappedScans((), footprint), MappedScans(ignore, footprint)):
+        kept, left = mapped_scans.of(scan).ranges_m > 0.0, mapped_scans.cloud(cloud)
+        assert 0 < kept.sum() < 360
+        assert np.array_equal(left.points_m, points[kept])
+        assert np.array_equal(left.times_s, times[kept])
+    assert MappedScans().cloud(cloud) is cloud
 
 
 def test_a_dense_scanner_whose_beams_vary_remains_one_laser():

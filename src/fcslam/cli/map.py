@@ -23,7 +23,7 @@ from fcslam.cli.options import (
     output_option,
     with_starts,
 )
-from fcslam.cli.output import RUNS, answers, new_folder, notices, print_line, verdict_lines
+from fcslam.cli.output import RUNS, answers, new_folder, notices, verdict_lines
 from fcslam.cli.warm_up import compiled, cores
 from fcslam.errors import InputError
 
@@ -103,13 +103,13 @@ def map_recordings(
         raise InputError("no recording is given; give one for each robot: fcslam map robot1.bag robot2.bag")
     with _without_collection():
         from fcslam.anchoring.anchors import read_anchors
-        from fcslam.api import in_3d, split_recordings
+        from fcslam.api import in_3d, notes_in_space, split_recordings
         from fcslam.cluster.verifying import verifying
         from fcslam.mission.mission import MissionInputs, continued_config
         from fcslam.mission.mission_file import EMPTY, read_mission
         from fcslam.robot.calibrating import calibrated
         from fcslam.runs import prepare_output
-        from fcslam.sources import open_fleet, planar_note
+        from fcslam.sources import open_fleet
 
         output = output or new_folder(RUNS)
         prepare_output(output, force)
@@ -119,8 +119,7 @@ def map_recordings(
         options = in_3d(bag_options(sensors), settings)
         with compiled(notices(quiet)):
             opened = [calibrated(source, settings.robot.lidar) for source in open_fleet(recordings, options)]
-        if settings.fleet.dimensions == 3 and (note := planar_note(opened)):
-            print_line(notices(quiet), note)
+        print_notes(notices(quiet), notes_in_space(opened, settings))
         sources = split_recordings(opened, split)
         floors = floors_of(floor or [], [source.name for source in sources])
     with verifying(workers) as verify:

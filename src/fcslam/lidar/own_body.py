@@ -69,11 +69,17 @@ SHARPEST: Final = 0.8
 @lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan
 def is_in_sectors(laser: LaserModel, sectors: Sectors) -> NDArray[np.bool_]:
     """Which beams of a laser look into the sectors, shape (beam_count,)."""
-    headings, found = _headings_deg(laser), np.zeros(laser.beam_count, np.bool_)
+    found = look_into_sectors(_headings_deg(laser), sectors)
+    found.setflags(write=False)
+    return found
+
+
+def look_into_sectors(headings_deg: FloatArray, sectors: Sectors) -> NDArray[np.bool_]:
+    """Which headings (N,) are in the sectors, shape (N,)."""
+    found = np.zeros(len(headings_deg), np.bool_)
     for first_deg, last_deg in sectors:
         width_deg = last_deg - first_deg if last_deg - first_deg >= 360.0 else np.remainder(last_deg - first_deg, 360.0)
-        found |= np.remainder(headings - first_deg, 360.0) <= width_deg
-    found.setflags(write=False)
+        found |= np.remainder(headings_deg - first_deg, 360.0) <= width_deg
     return found
 
 

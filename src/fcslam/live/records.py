@@ -173,8 +173,8 @@ class RobotStatus:
     times_lost: int = 0
     """Number of times the robot was lost since it started or came to its floor."""
     notices: tuple[str, ...] = ()
-    """Messages about packets of another mission, refused packets, the last detector update, a failed back end, and
-    jumps of the odometry, if there were any."""
+    """Messages about packets of another mission, refused packets, the last detector update, a failed back end, jumps
+    of the odometry, and settings without effect, if there were any."""
     is_localized: bool | None = None
     """Whether the robot knows its pose in a finished map; None if it makes a map of its own."""
 

@@ -34,6 +34,7 @@ from fcslam.mission.driving import track_of
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import (
     CameraModel,
+    CloudScan,
     Correction,
     FloatArray,
     Keyscan,
@@ -206,6 +207,7 @@ class Robot(LiveTracker):
         failure = self._frontend.packets.failure
         broken = f"no closures and places from now on, as the back end failed: {failure}" if failure else None
         jumps = "the odometry jumps; scan matching bridges it" if self.odometry_jumps else None
+        unused = self._config.robot.unused_in_space if self._frontend.scans is CloudScan else None
         status = RobotStatus(
             scans=self._scans,
             keyscans=self._keyscans,
@@ -213,7 +215,7 @@ class Robot(LiveTracker):
             correction_age_s=localizer.age_s,
             quality=localizer.quality,
             times_lost=self._session - max(session for session, track in enumerate(tracks) if track.is_new_floor),
-            notices=tuple(filter(None, (*(uplink.notices if uplink else ()), broken, jumps))),
+            notices=tuple(filter(None, (*(uplink.notices if uplink else ()), broken, jumps, unused))),
         )
         if uplink is None:
             return status

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,6 +47,13 @@ class RobotConfig(SessionConfig):
     """Settings of one robot."""
 
     lost: LostConfig = Field(default=LostConfig(), description="when the robot is lost and starts a new session")
+
+    @property
+    def unused_in_space(self) -> str:
+        """Which settings do nothing for a robot with a 3D LiDAR, one line; empty if those have their defaults."""
+        planar = ("lidar.scan_duration_s", "lidar.tracker", "lidar.keyscans", "views", "tags", "lost")
+        unused = [f"robot.{name}" for name in planar if attrgetter(name)(self) != attrgetter(name)(RobotConfig())]
+        return f"{', '.join(unused)}: only robots with 2D LiDARs use these settings" if unused else ""
 
 
 class NewestScan(NamedTuple):

@@ -36,6 +36,7 @@ from fcslam.records import (
     frozen,
 )
 from fcslam.robot.backend import SessionConfig, Task
+from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.packet_queue import PacketQueue
 from fcslam.robot.track import ScanBelief, ScanTrack
 from fcslam.sources.clouds_in_space import BAND_LASER
@@ -78,6 +79,7 @@ class RobotFrontend3d:
         """The newest keyframe, and ``T_odom_ground`` there, shape (7,); None before the first."""
         self.lacks_odometry, self.odometry_fault = True, None
         self._describes = Channel.LIDAR in config.channels
+        self._mapped_scans = MappedScans(config.lidar.ignore, config.lidar.footprint)
         self.packets = PacketQueue(robot, _passed_on)
         self._stamp = self._certain_s = -np.inf
         self._begin(ScanTrack(floor, is_new_floor=True, group=SE3))
@@ -121,7 +123,7 @@ class RobotFrontend3d:
             if record.new_floor:
                 self.change_floor(record.new_floor)
             self._stamp = record.stamp
-            self._track(record)
+            self._track(self._mapped_scans.cloud(record))
         return self.ready()
 
     def ready(self, wait: bool = False) -> list[Packet]:

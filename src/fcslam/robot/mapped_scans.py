@@ -7,9 +7,9 @@ import numpy as np
 
 from fcslam.geometry.beams import beam_step
 from fcslam.lidar.frontend import laser_index
-from fcslam.lidar.own_body import Polygon, Sectors, is_in_polygon, is_in_sectors
+from fcslam.lidar.own_body import Polygon, Sectors, is_in_polygon, is_in_sectors, look_into_sectors
 from fcslam.lidar.scan import rays_of
-from fcslam.records import Beams, LaserModel, LaserScan, Sweep, frozen
+from fcslam.records import Beams, CloudScan, LaserModel, LaserScan, Sweep, frozen
 from fcslam.sources.contradictions import count_returns
 from fcslam.wire.limits import MAXIMUM_LASER_RANGE_M
 from fcslam.wire.quantisation import rounded
@@ -52,6 +52,16 @@ class MappedScans:
         if not count_returns(ranges_m, laser.max_range_m):
             ranges_m = frozen(np.zeros_like(ranges_m), np.float32)
         return LaserScan(scan.stamp, ranges_m, laser, scan.T_odom_base, sweep, scan.on_teammates)
+
+    def cloud(self, scan: CloudScan) -> CloudScan:
+        """The turn of a 3D LiDAR as it is mapped: without its points in the sectors and within the footprint."""
+        if not (self._ignore or self._footprint):
+            return scan
+        xy = scan.points_m[:, :2].astype(np.float64)
+        x, y = (xy - scan.origin_m[:2]).T
+        own = look_into_sectors(np.degrees(np.arctan2(y, x)), self._ignore) | is_in_polygon(xy, self._footprint)
+        points_m, times_s = frozen(scan.points_m[~own], np.float32), frozen(scan.times_s[~own], np.float32)
+        return replace(scan, points_m=points_m, times_s=times_s)
 
 
 @lru_cache(maxsize=256)  # the beams of some scanners vary from scan to scan

@@ -58,11 +58,16 @@ def whole_clouds(source: Source, options: BagOptions | None) -> Source:
     return in_3d(bag)
 
 
-def planar_note(sources: Sequence[Source]) -> str:
-    """What robots without clouds do in a map in space, one line; empty if all have clouds."""
+def is_whole(source: Source) -> bool:
+    """Whether the clouds of a recording are read whole, for a robot with a 3D LiDAR."""
     from fcslam.sources.clouds_in_space import CloudRecording
 
-    planar = [source.name for source in sources if not isinstance(source, CloudRecording)]
+    return isinstance(source, CloudRecording)
+
+
+def planar_note(sources: Sequence[Source]) -> str:
+    """What robots without clouds do in a map in space, one line; empty if all have clouds."""
+    planar = [source.name for source in sources if not is_whole(source)]
     return IN_PLANE.format(", ".join(planar)) if planar else ""
 
 
