@@ -185,6 +185,7 @@ def test_without_noise_is_the_difference_and_never_negative() -> None:
     assert factors[:6, :6] @ information @ factors[:6, :6].T == pytest.approx(kept)
     weak = np.diag([1.0, 1e6, 1e6, 1e6, 1e6, 1e6])
     kept, _ = without_noise(weak, 10.0 * unit)
+    assert not without_noise(0.0 * unit, 0.0 * unit)[0].any(), "nothing was near"
     assert np.abs(kept[0]).max() < 1e-6
     assert kept[1, 1] == pytest.approx(1e6, rel=1e-4)
 

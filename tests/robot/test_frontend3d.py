@@ -109,3 +109,15 @@ def test_a_clock_that_steps_back_begins_a_session() -> None:
     packets += robot.finish()
     assert [len(track) for track in robot.tracks] == [4, 4]
     assert [packet.epoch for packet in packets if isinstance(packet.body, Hello)] == [0, 1]
+
+
+@pytest.mark.parametrize(("moved_m", "scans"), [(0.0, [8]), (17.0, [4, 4])])
+def test_a_robot_that_drove_far_while_its_lidar_paused_begins_a_session(moved_m: float, scans: list[int]) -> None:
+    robot, packets = RobotFrontend3d("anna", SessionConfig()), []
+    for number, (scan, _) in enumerate(drive(room(1), circle((6.0, 4.0), 0.8, 0.2), 8)):
+        pause_s, ahead_m = (24.0, moved_m) if number >= 4 else (0.0, 0.0)
+        wheels = scan.wheels + np.array([pause_s, ahead_m, 0.0, 0.0])
+        packets += robot.process(replace(scan, stamp=scan.stamp + pause_s, wheels=wheels))
+    packets += robot.finish()
+    assert [len(track) for track in robot.tracks] == scans
+    assert not [packet for packet in packets if isinstance(packet.body, Constraint)], "nobody saw the way"

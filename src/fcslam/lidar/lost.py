@@ -31,7 +31,7 @@ from fcslam.lidar.scan import point_scan
 from fcslam.lidar.submap import Agreement
 from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M, SUPPORTED, TrackingResult
 from fcslam.lidar.verification import LOOSE, verify
-from fcslam.records import FloatArray, LaserScan
+from fcslam.records import CloudScan, FloatArray, LaserScan
 
 DOUBTFUL_TRAVEL_M = 1.0
 """Least travel over consecutive doubtful scans before they are compared, metres."""
@@ -80,7 +80,7 @@ class LostConfig(Settings):
     )
 
 
-def has_moved_unseen(before: LaserScan, now: LaserScan) -> bool:
+def has_moved_unseen(before: LaserScan | CloudScan, now: LaserScan | CloudScan) -> bool:
     """Whether a robot moved so far between two scans that odometry alone must not tie their places together."""
     x, y, _ = se2.motion(before.T_odom_base, now.T_odom_base)
     return math.hypot(x, y) > LARGEST_STEP_M

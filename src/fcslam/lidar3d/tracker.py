@@ -244,7 +244,7 @@ def _fit(
 def without_noise(information: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Information (6, 6) without the ``noise`` (6, 6) that errors of the normals make, and the factors of the Jacobians
     of two poses that give it, shape (12, 12)."""
-    root = np.linalg.cholesky(information + 1e-9 * np.trace(information) * np.eye(6))
+    root = np.linalg.cholesky(information + 1e-9 * max(np.trace(information), 1.0) * np.eye(6))  # 0 if nothing is near
     white = np.linalg.inv(root)
     shares, vectors = np.linalg.eigh(white @ noise @ white.T)
     trusted = root @ (vectors * np.sqrt(np.maximum(1.0 - shares, 0.0))) @ vectors.T @ white

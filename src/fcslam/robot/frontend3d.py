@@ -17,6 +17,7 @@ from fcslam.features.birdseye import DETECTOR_VERSION, describe
 from fcslam.geometry import se3
 from fcslam.geometry.groups import SE3
 from fcslam.lidar.frontend import ScanPose
+from fcslam.lidar.lost import has_moved_unseen
 from fcslam.lidar.voxel_map import columns
 from fcslam.lidar3d.ground import levelled, seen_by
 from fcslam.lidar3d.local_maps import KeyframeMotion, Keyframes, MappedTurn, SurfaceMap, SurfaceMaps
@@ -81,7 +82,8 @@ class RobotFrontend3d:
         self._describes = Channel.LIDAR in config.channels
         self._mapped_scans = MappedScans(config.lidar.ignore, config.lidar.footprint)
         self.packets = PacketQueue(robot, _passed_on)
-        self._stamp = self._certain_s = -np.inf
+        self._before: CloudScan | None = None
+        """The newest turn; None if the next one is of another place."""
         self._begin(ScanTrack(floor, is_new_floor=True, group=SE3))
 
     @property
@@ -117,12 +119,11 @@ class RobotFrontend3d:
     def process(self, record: SensorRecord) -> list[Packet]:
         """Process the next record of the recording; returns the packets that are ready."""
         if isinstance(record, CloudScan):
-            gap_s = record.stamp - self._stamp
-            if gap_s < -MAX_STEP_BACK_S or (gap_s > MAX_STEP_BACK_S and not len(record.wheels)):
+            if self._before is not None and _is_unconnected(self._before, record):
                 self.begin_session()
             if record.new_floor:
                 self.change_floor(record.new_floor)
-            self._stamp = record.stamp
+            self._before = record
             self._track(self._mapped_scans.cloud(record))
         return self.ready()
 
@@ -151,7 +152,8 @@ class RobotFrontend3d:
         self.tracks.append(track)
         self._tracker, self._keyframes, self._local_maps = Tracker3d(), Keyframes(), SurfaceMaps()
         self._poor = 0
-        self._stamp = self._certain_s = -np.inf
+        self._certain_s = -np.inf
+        self._before = None
 
     def _track(self, scan: CloudScan) -> None:
         tracked = self._tracker.track(scan)
@@ -160,7 +162,7 @@ class RobotFrontend3d:
         if self._poor > SETTLED:  # the surfaces do not explain where it is any more
             self.scan_poses.cut(self._certain_s)
             self.begin_session()
-            self._stamp = scan.stamp
+            self._before = scan
             tracked = self._tracker.track(scan)
         if not self._poor:
             self._certain_s = scan.stamp
@@ -218,6 +220,13 @@ class RobotFrontend3d:
 
     def _send(self, body: Body | Task) -> None:
         self.packets.submit(body, len(self.tracks) - 1, self.scan_poses)
+
+
+def _is_unconnected(before: CloudScan, now: CloudScan) -> bool:
+    """Whether nothing shows the motion between two turns."""
+    gap_s = now.stamp - before.stamp
+    is_gap = gap_s > MAX_STEP_BACK_S and not len(now.wheels)
+    return is_gap or gap_s < -MAX_STEP_BACK_S or has_moved_unseen(before, now)
 
 
 def _passed_on(body: Body | Task) -> Future[list[Body]]:
