@@ -10,6 +10,16 @@ from fcslam.lidar3d.surfels import SurfelMap
 from fcslam.lidar3d.tracker import Tracker3d, fit_rigid
 from tests.spinning_lidar import circle, drive, room
 
+CORRIDOR = np.array(
+    [
+        ((-99, -3, -0.2), (99, 3, 0)),
+        ((-99, -3, 3), (99, 3, 3.2)),
+        ((-99, 1.2, 0), (99, 1.4, 3)),
+        ((-99, -1.4, 0), (99, -1.2, 3)),
+    ],
+    float,
+)
+
 
 def errors(tracker: Tracker3d, turns: object) -> np.ndarray:
     """Tangents of the errors of all poses relative to the first, shape (N, 6)."""
@@ -32,21 +42,20 @@ def test_poses_are_right_whatever_else_measures_the_motion(wheels: bool, gyro: b
 
 
 def test_a_plain_corridor_says_nothing_along_its_axis_and_wheels_hold_it() -> None:
-    corridor = np.array(
-        [
-            ((-99, -3, -0.2), (99, 3, 0)),
-            ((-99, -3, 3), (99, 3, 3.2)),
-            ((-99, 1.2, 0), (99, 1.4, 3)),
-            ((-99, -1.4, 0), (99, -1.2, 3)),
-        ],
-        float,
-    )
     tracker = Tracker3d()
-    found = errors(tracker, drive(corridor, lambda t: np.array([0.5 * t, 0.0, 0.0]), 40))
+    found = errors(tracker, drive(CORRIDOR, lambda t: np.array([0.5 * t, 0.0, 0.0]), 40))
     assert np.abs(found[:, 0]).max() < 0.05
-    scan, _ = next(drive(corridor, lambda t: np.array([2.0 + 0.5 * t, 0.0, 0.0]), 1))
+    scan, _ = next(drive(CORRIDOR, lambda t: np.array([2.0 + 0.5 * t, 0.0, 0.0]), 1))
     information = tracker.track(replace(scan, stamp=4.0, wheels=scan.wheels + np.array([4.0, 0.0, 0.0, 0.0]))).measured
     assert information[0, 0] < 1e-3 * information[1, 1]
+
+
+def test_wheels_hold_a_robot_that_stops_in_a_plain_corridor_while_its_lidar_pauses() -> None:
+    turns = list(drive(CORRIDOR, lambda t: np.array([min(t, 2.0), 0.0, 0.0]), 45))
+    kept, missed = [*turns[:19], *turns[34:]], [scan.wheels for scan, _ in turns[19:34]]
+    after, pose = kept[19]
+    kept[19] = replace(after, wheels=np.concatenate((*missed, after.wheels))), pose
+    assert np.abs(errors(Tracker3d(), kept)[:, 0]).max() < 0.05, "constant velocity explains the walls as well"
 
 
 def test_both_sides_of_a_thin_wall_stay_apart() -> None:

@@ -1,12 +1,13 @@
 """The front end of a robot with a 3D LiDAR: packets that the wire accepts, tracks, closures and sessions."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from fcslam.geometry import se3
+from fcslam.geometry import se2, se3
 from fcslam.live.records import Wiring
 from fcslam.live.robot import Robot
 from fcslam.records import Constraint, ConstraintKind, Keyscan, Place, VoxelMap
@@ -121,3 +122,52 @@ def test_a_robot_that_drove_far_while_its_lidar_paused_begins_a_session(moved_m:
     packets += robot.finish()
     assert [len(track) for track in robot.tracks] == scans
     assert not [packet for packet in packets if isinstance(packet.body, Constraint)], "nobody saw the way"
+
+
+@pytest.fixture(scope="module")
+def straight() -> list:
+    return list(drive(room(1), lambda t: np.array([2.0 + t, 4.0 + 0.1 * np.sin(t), 0.1 * np.cos(t)]), 60, azimuths=120))
+
+
+def jump(by: tuple[float, float, float]) -> Callable[[np.ndarray], np.ndarray]:
+    """Wheels that go on elsewhere after 2.55 s, with the robot moved by so much."""
+    at = np.array([4.55, 4.06, -0.08])
+    T = se2.compose(se2.compose(at, by), se2.inverse(at))
+    return lambda read: np.where(read[:, :1] > 2.55, se2.compose(T, read[:, 1:]), read[:, 1:])
+
+
+def frozen(since_s: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Wheels that stand still from a time on."""
+    return lambda read: np.where(read[:, :1] > since_s, (2.0 + since_s, 4.0, 0.1), read[:, 1:])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("wheels", "jumps"),
+    [
+        *((jump((by_m, 0.0, 0.0)), int(abs(by_m) > 1.5)) for by_m in (0.3, 0.5, -1.0, 2.0, 5.0, -50.0)),
+        (jump((0.0, 0.0, 0.3)), 0),
+        (jump((3.0, -2.0, 2.5)), 1),
+        (frozen(0.0), 0),
+        (frozen(2.5), 0),
+    ],
+)
+def test_the_path_is_right_though_the_odometry_jumps_or_stands(
+    straight: list, wheels: Callable[[np.ndarray], np.ndarray], jumps: int
+) -> None:
+    robot, packets = RobotFrontend3d("anna", SessionConfig()), []
+    for scan, _ in straight:
+        packets += robot.process(replace(scan, wheels=np.column_stack((scan.wheels[:, 0], wheels(scan.wheels)))))
+    assert len(robot.tracks) == 1
+    assert robot.jumps == jumps
+    truth = np.array([pose for _, pose in straight])
+    found = robot.scan_poses.T_odom_base()
+    assert np.abs(se3.log(se3.between(se3.between(truth[0], truth), found))[:, :3]).max() < 0.1
+
+
+def test_wheels_that_stand_while_the_clouds_change_are_named(straight: list) -> None:
+    robot = RobotFrontend3d("anna", SessionConfig())
+    for scan, _ in straight[::3]:
+        robot.process(replace(scan, wheels=scan.wheels * np.array([1.0, 0.0, 0.0, 0.0])))
+    assert robot.odometry_fault == "never changes in 19 poses"
+    assert robot.lacks_odometry

@@ -60,14 +60,14 @@ class MotionSensors:
         self._wheels = newest(self._wheels, scan.wheels, scan.stamp - KEPT_S)
         self._imu = newest(self._imu, scan.imu, scan.stamp - KEPT_S)
 
-    def predict(self, times: FloatArray) -> Prediction:
-        """The motion over ascending ``times`` (K,), seconds."""
+    def predict(self, times: FloatArray, by_wheels: bool = True) -> Prediction:
+        """The motion over ascending ``times`` (K,), seconds, by the wheels or as if there were none."""
         spans = np.diff(times)
         moves, turns = spans[:, None] * self.velocity[:3], spans[:, None] * self.velocity[3:]
         length_s = times[-1] - times[0]
         sigma = length_s * (_ACCELERATION * max(length_s, 0.05) if self._is_moving_known else _UNKNOWN)
         planar = rotation = None
-        if covers(self._wheels, times):
+        if by_wheels and covers(self._wheels, times):
             path = self._path(times)
             planar = se2.motion(path[0], path[-1])
             steps = np.array([self.trust.distance.value] * 2 + [self.trust.turn.value]) * se2.relative(path)

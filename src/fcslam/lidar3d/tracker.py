@@ -6,6 +6,7 @@ gyro hold those directions in which the surfaces say little: information about a
 could make is taken away.
 """
 
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 
 from fcslam.compiled import njit
 from fcslam.geometry import se3
-from fcslam.lidar3d.motion import MotionSensors
+from fcslam.lidar.odometry import PRIOR_TAIL
+from fcslam.lidar3d.motion import MotionSensors, Prediction
 from fcslam.lidar3d.surfels import POINT_SIGMA_M, SIZES_M, SurfelMap, corrected
 from fcslam.records import CloudScan, FloatArray
 from fcslam.sources.point_clouds import FARTHEST_M
@@ -32,6 +34,8 @@ _POOR_FACTOR, _POOR_LEAST = 3.0, 0.02
 """A registration is poor if more points than the second number, and this many times the usual, miss their surface."""
 SETTLED: Final = 20
 """Turns after which it is known what is usual."""
+_CONTRADICTION: Final = np.array([_GATES_M[0]] * 3 + [0.1] * 3)
+"""Wheels that differ by more from constant velocity may have jumped."""
 _JOLT_RAD: Final = 0.08
 """Standard deviation of a sudden tilt, as at the edge of a ramp."""
 _JOLTS: Final = np.array([0.75, 1.5, -0.75, -1.5])
@@ -117,12 +121,11 @@ class Tracker3d:
         first_s, last_s = (float(times.min()), float(times.max())) if len(times) else (0.0, 0.0)
         length_s = max(last_s - first_s, 1e-3)
         begin_s = scan.stamp + first_s
-        T_odom_begin = self._predicted_begin(begin_s)
-        predicted = self.sensors.predict(begin_s + np.linspace(0.0, length_s, _STEPS + 1))
         shares = (times - first_s) / length_s
+        T_odom_begin, self._covariance, predicted = self._predicted(begin_s, length_s, points, shares)
         deskewed = _deskew(points, shares, predicted.poses)
         chosen = thinned(deskewed, SIZES_M[-1], MOST_POINTS)
-        fit = self._fitted(deskewed[chosen], shares[chosen], T_odom_begin, predicted.poses[-1], predicted.sigma)
+        fit = self._fitted(deskewed[chosen], shares[chosen], T_odom_begin, predicted)
         begin = se3.compose(T_odom_begin, se3.exp(fit.corrections[0]))
         end = se3.compose(T_odom_begin, se3.compose(se3.exp(fit.corrections[1]), predicted.poses[-1]))
         to_end = se3.adjoint(se3.inverse(predicted.poses[-1]))
@@ -158,31 +161,45 @@ class Tracker3d:
             self._is_poor,
         )
 
-    def _predicted_begin(self, begin_s: float) -> FloatArray:
-        """Predict the pose at the begin of a turn from the end of the one before; the uncertainty grows."""
+    def _predicted(
+        self, begin_s: float, length_s: float, points: FloatArray, shares: FloatArray
+    ) -> tuple[FloatArray, FloatArray, Prediction]:
+        """The pose at the begin of a turn with its covariance, and the motion during the turn: by the wheels, unless
+        constant velocity contradicts them and explains clearly more ``points``."""
+        found = self._prediction(begin_s, length_s)
+        if not self._turns or found[2].planar is None:
+            return found
+        other = self._prediction(begin_s, length_s, by_wheels=False)
+        ends = (se3.compose(begin, within.poses[-1]) for begin, _, within in (found, other))
+        if (np.abs(se3.log(se3.between(*ends))) < _CONTRADICTION).all():
+            return found
+        on_surface = []
+        for begin, covariance, within in (found, other):
+            deskewed = _deskew(points, shares, within.poses)
+            chosen = thinned(deskewed, SIZES_M[-1], MOST_POINTS)
+            fit = self._fit(deskewed[chosen], shares[chosen], begin, within, covariance, within.sigma)
+            on_surface.append(fit.on_surface / max(len(chosen), 1))
+        return other if on_surface[1] > on_surface[0] + _POOR_LEAST else found
+
+    def _prediction(
+        self, begin_s: float, length_s: float, by_wheels: bool = True
+    ) -> tuple[FloatArray, FloatArray, Prediction]:
+        within = self.sensors.predict(begin_s + np.linspace(0.0, length_s, _STEPS + 1), by_wheels)
         gap_s = begin_s - self._end_s
         if not np.isfinite(gap_s):
-            return self._T_odom_end
-        self._covariance = self._covariance + np.diag(_MAP_SIGMA**2)
+            return self._T_odom_end, self._covariance, within
+        covariance = self._covariance + np.diag(_MAP_SIGMA**2)
         if abs(gap_s) < 1e-4:
-            return self._T_odom_end
-        between = self.sensors.predict(self._end_s + np.linspace(0.0, gap_s, _STEPS + 1))
+            return self._T_odom_end, covariance, within
+        between = self.sensors.predict(self._end_s + np.linspace(0.0, gap_s, _STEPS + 1), by_wheels)
         back = se3.adjoint(se3.inverse(between.poses[-1]))
-        self._covariance = back @ self._covariance @ back.T + np.diag(between.sigma**2)
-        return se3.compose(self._T_odom_end, between.poses[-1])
+        covariance = back @ covariance @ back.T + np.diag(between.sigma**2)
+        return se3.compose(self._T_odom_end, between.poses[-1]), covariance, within
 
-    def _fitted(
-        self, points: FloatArray, shares: FloatArray, T_odom_begin: FloatArray, predicted: FloatArray, sigma: FloatArray
-    ) -> _Fit:
+    def _fitted(self, points: FloatArray, shares: FloatArray, T_odom_begin: FloatArray, predicted: Prediction) -> _Fit:
         if not self._turns:
             return _Fit(np.zeros((2, 6)), np.diag(np.tile(_MAP_SIGMA, 2) ** 2), np.zeros((6, 6)), 0, 1.0)
-        to_end = se3.adjoint(se3.inverse(predicted))
-
-        def fit(covariance: FloatArray, sigma: FloatArray, tilt: float = 0.0) -> _Fit:
-            start = np.array([0.0, 0.0, 0.0, 0.0, tilt, 0.0])
-            motion_information = to_end.T @ np.diag(sigma**-2) @ to_end
-            return _fit(self._map, points, shares, T_odom_begin, inverse(covariance), motion_information, start)
-
+        fit, sigma = partial(self._fit, points, shares, T_odom_begin, predicted), predicted.sigma
         first = fit(self._covariance, sigma)
         tries = [fit(self._covariance, sigma, tilt) for tilt in _JOLT_RAD * _JOLTS] if self._is_poor else []
         best = max((first, *tries), key=lambda each: each.on_surface)
@@ -196,6 +213,22 @@ class Tracker3d:
             return max((best, *tries), key=lambda each: each.on_surface)
         self._usual += 2.0 / SETTLED * (best.share - self._usual)
         return best
+
+    def _fit(
+        self,
+        points: FloatArray,
+        shares: FloatArray,
+        T_odom_begin: FloatArray,
+        predicted: Prediction,
+        covariance: FloatArray,
+        sigma: FloatArray,
+        tilt: float = 0.0,
+    ) -> _Fit:
+        to_end = se3.adjoint(se3.inverse(predicted.poses[-1]))
+        start = np.array([0.0, 0.0, 0.0, 0.0, tilt, 0.0])
+        motion_information = to_end.T @ np.diag(sigma**-2) @ to_end
+        by_wheels = predicted.planar is not None
+        return _fit(self._map, points, shares, T_odom_begin, inverse(covariance), motion_information, start, by_wheels)
 
     def _insert(self, points: FloatArray, origin: FloatArray, motion: FloatArray) -> None:
         tangent = se3.log(motion)
@@ -216,12 +249,9 @@ def _fit(
     begin_information: FloatArray,
     motion_information: FloatArray,
     start: FloatArray,
+    by_wheels: bool = False,
 ) -> _Fit:
     """Gauss-Newton for the corrections of the begin and the end of a turn; ``start`` is that of both at first."""
-    prior = np.zeros((12, 12))
-    prior[:6, :6] = begin_information + motion_information
-    prior[6:, 6:] = motion_information
-    prior[:6, 6:] = prior[6:, :6] = -motion_information
     rotation, position = se3.rotation(T), T[:3].copy()
     corrections = np.concatenate((start, start))
     for gate_m in _GATES_M:
@@ -230,6 +260,10 @@ def _fit(
         )
         measured, trusted = without_noise(H[:6, :6] + H[6:, 6:] + H[:6, 6:] + H[6:, :6], noise)
         H, b = _CORRELATED * (trusted @ H @ trusted.T), _CORRELATED * (trusted @ trusted @ b)
+        begin, motion = begin_information, motion_information
+        if by_wheels:
+            begin, motion = _unslipped(begin, corrections[:6]), _unslipped(motion, corrections[6:] - corrections[:6])
+        prior = np.block([[begin + motion, -motion], [-motion, motion]])
         step = np.linalg.solve(H + prior, -(b + prior @ corrections))
         corrections = corrections + step
         if gate_m == _GATES_M[-1] and np.abs(step).max() < 0.1 * _MAP_SIGMA.min():
@@ -239,6 +273,11 @@ def _fit(
         for gate_m in (_NEAR_SURFACE_M, 3.0 * POINT_SIGMA_M)
     )
     return _Fit(corrections.reshape(2, 6), inverse(H + prior), _CORRELATED * measured, on, on / max(near, 1))
+
+
+def _unslipped(information: FloatArray, error: FloatArray) -> FloatArray:
+    """Information (6, 6) of wheels about an ``error`` (6,), which has a Student t distribution, as they may slip."""
+    return (PRIOR_TAIL + 6.0) / (PRIOR_TAIL + max(float(error @ information @ error), 6.0)) * information
 
 
 def without_noise(information: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:

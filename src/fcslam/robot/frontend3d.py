@@ -40,6 +40,7 @@ from fcslam.robot.backend import SessionConfig, Task
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.packet_queue import PacketQueue
 from fcslam.robot.track import ScanBelief, ScanTrack
+from fcslam.robot.wheel_odometry import WheelOdometry
 from fcslam.sources.clouds_in_space import BAND_LASER
 from fcslam.sources.gate import MAX_STEP_BACK_S
 from fcslam.wire.messages import Body, Hello, Packet
@@ -72,13 +73,12 @@ class RobotFrontend3d:
         self.robot = robot
         self.tracks: list[ScanTrack] = []
         """Poses of the turns, by session."""
-        self.jumps = 0
-        """As in ``RobotFrontend``: turns are registered whatever the odometry says."""
+        self.odometry = WheelOdometry()
         self.newest: NewestTurn | None = None
         """The newest turn; None before the first."""
         self.mapped: tuple[MappedTurn, FloatArray] | None = None
         """The newest keyframe, and ``T_odom_ground`` there, shape (7,); None before the first."""
-        self.lacks_odometry, self.odometry_fault = True, None
+        self.lacks_odometry = True
         self._describes = Channel.LIDAR in config.channels
         self._mapped_scans = MappedScans(config.lidar.ignore, config.lidar.footprint)
         self.packets = PacketQueue(robot, _passed_on)
@@ -90,6 +90,16 @@ class RobotFrontend3d:
     def scan_poses(self) -> ScanTrack:
         """Poses of the turns of the present session."""
         return self.tracks[-1]
+
+    @property
+    def jumps(self) -> int:
+        """As in ``RobotFrontend``."""
+        return self.odometry.jumps
+
+    @property
+    def odometry_fault(self) -> str | None:
+        """As in ``RobotFrontend``; None once it says something again."""
+        return self.odometry.check.fault if self.lacks_odometry else None
 
     @property
     def pose(self) -> ScanPose:
@@ -119,12 +129,13 @@ class RobotFrontend3d:
     def process(self, record: SensorRecord) -> list[Packet]:
         """Process the next record of the recording; returns the packets that are ready."""
         if isinstance(record, CloudScan):
+            record = self.odometry.place_cloud(self._mapped_scans.cloud(record))
             if self._before is not None and _is_unconnected(self._before, record):
                 self.begin_session()
             if record.new_floor:
                 self.change_floor(record.new_floor)
             self._before = record
-            self._track(self._mapped_scans.cloud(record))
+            self._track(record)
         return self.ready()
 
     def ready(self, wait: bool = False) -> list[Packet]:

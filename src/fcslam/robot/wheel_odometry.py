@@ -10,7 +10,8 @@ import numpy as np
 from fcslam.geometry import se2
 from fcslam.lidar.first_motion import LONGEST_GAP_S
 from fcslam.lidar.odometry import WHEELS
-from fcslam.records import CameraImage, FloatArray, LaserScan, frozen
+from fcslam.records import CameraImage, CloudScan, FloatArray, LaserScan, frozen
+from fcslam.sources.clouds_in_space import BAND_LASER
 from fcslam.sources.contradictions import CHANGED, changed_share, stands_still
 from fcslam.sources.faults import FEWEST
 from fcslam.sources.path_summary import PathSummary
@@ -38,7 +39,7 @@ class WheelCheck:
         """Why it is not odometry, as the end of a sentence; None if it can be."""
         self.certain_s = -math.inf
         """Stamp of the newest scan at which the odometry moved, or which measures what the scan at rest does."""
-        self._at_rest: LaserScan | None = None
+        self._at_rest: LaserScan | CloudScan | None = None
         """The first scan; once the odometry has said something, the first one where it now stands."""
         self._path = PathSummary()
         """Odometry until it says something."""
@@ -50,7 +51,7 @@ class WheelCheck:
         """Whether odometry that measured the motion before stands still, and the newest scan has changed."""
         return self._changed > 0 and self._path.says_something
 
-    def says_nothing(self, scan: LaserScan) -> bool:
+    def says_nothing(self, scan: LaserScan | CloudScan) -> bool:
         """Whether the odometry up to the next scan says nothing while the scans change, or the first one has none."""
         if self._at_rest is None:
             self._at_rest = scan
@@ -61,8 +62,9 @@ class WheelCheck:
         if self._path.says_something and not stands_still(self._at_rest, scan):
             self._at_rest, self._changed, self.certain_s = scan, 0, scan.stamp
             return False
-        if scan.laser == self._at_rest.laser:
-            share = changed_share(self._at_rest.ranges_m, scan.ranges_m, scan.laser.max_range_m)
+        before, now = _in_plane(self._at_rest), _in_plane(scan)
+        if now.laser == before.laser:
+            share = changed_share(before.ranges_m, now.ranges_m, now.laser.max_range_m)
             self._changed = self._changed + 1 if share > CHANGED else 0
             if not share > SLIGHTLY_CHANGED:  # true for NaN
                 self.certain_s = scan.stamp
@@ -92,24 +94,40 @@ class WheelOdometry:
 
     def place(self, scan: LaserScan) -> LaserScan:
         """The next scan, with its odometry free of jumps."""
-        read = scan.T_odom_base
+        read = self._read(scan.stamp, scan.T_odom_base)
+        scan = self._with_possible_sweep(scan)
+        if self._bridge is None and read is scan.T_odom_base:
+            return scan
+        return replace(scan, T_odom_base=frozen(self.bridged(read)))
+
+    def place_cloud(self, scan: CloudScan) -> CloudScan:
+        """The next turn of a 3D LiDAR, with the readings of its wheels free of jumps; without those that say
+        nothing."""
+        if not len(scan.wheels):
+            return scan
+        wheels = scan.wheels.copy()
+        for row in wheels:
+            row[1:] = self.bridged(self._read(float(row[0]), row[1:].copy()))
+        scan = replace(scan, wheels=frozen(wheels))
+        says_nothing = self.check.says_nothing(scan) or self.may_be_frozen
+        return replace(scan, wheels=scan.wheels[:0]) if says_nothing else scan
+
+    def _read(self, stamp: float, read: FloatArray) -> FloatArray:
+        """A pose (3,) that was read, or where it should be if it is not finite; a jump moves the frame ``odom``."""
         if self._last is not None:
-            stamp, before = self._last
+            before_s, before = self._last
             if not all(map(math.isfinite, read.tolist())):
                 self.jumps += 1
                 read = se2.compose(before, self._motion)
             x, y, turn = motion = se2.motion(before, read)
             moved_m = math.hypot(x, y)
-            if is_jump(motion, scan.stamp - stamp):
+            if is_jump(motion, stamp - before_s):
                 self.jumps += 1
                 self._bridge = se2.compose(se2.compose(self.bridged(before), self._motion), se2.inverse(read))
             elif moved_m > LEAST_BRIDGE_M or abs(turn) > LEAST_BRIDGE_RAD:
                 self._motion = motion
-        self._last = scan.stamp, read
-        scan = self._with_possible_sweep(scan)
-        if self._bridge is None and read is scan.T_odom_base:
-            return scan
-        return replace(scan, T_odom_base=frozen(self.bridged(read)))
+        self._last = stamp, read
+        return read
 
     def _with_possible_sweep(self, scan: LaserScan) -> LaserScan:
         """The scan; if odometry jumped during its sweep, with the velocity in the sweep before."""
@@ -137,6 +155,16 @@ class WheelOdometry:
     def bridged(self, T_odom_base: FloatArray) -> FloatArray:
         """A pose that was read, shape (3,), in the first frame ``odom``."""
         return T_odom_base if self._bridge is None else se2.compose(self._bridge, T_odom_base)
+
+
+def _in_plane(scan: LaserScan | CloudScan) -> LaserScan:
+    """The scan, or what a 2D laser would see of a cloud."""
+    if isinstance(scan, LaserScan):
+        return scan
+    from fcslam.lidar3d.ground import seen_by  # a robot with a 2D laser does not load it
+
+    points = scan.points_m.astype(np.float64)
+    return LaserScan(scan.stamp, seen_by(BAND_LASER, points, points), BAND_LASER, scan.T_odom_base)
 
 
 def is_jump(motion: se2.Pose, within_s: float) -> bool:

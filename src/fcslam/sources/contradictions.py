@@ -11,7 +11,7 @@ from math import hypot, inf, isnan, remainder, tau
 
 import numpy as np
 
-from fcslam.records import LaserScan, Ranges
+from fcslam.records import CloudScan, LaserScan, Ranges
 from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.motion import STILL_M, STILL_RAD
 from fcslam.sources.pose import Pose
@@ -79,7 +79,7 @@ def _repeats(before: LaserScan, after: LaserScan) -> bool:
     return count_returns(after.ranges_m, after.laser.max_range_m) >= FEWEST_RETURNS
 
 
-def stands_still(before: LaserScan, after: LaserScan) -> bool:
+def stands_still(before: LaserScan | CloudScan, after: LaserScan | CloudScan) -> bool:
     """Whether the odometry stood still between two scans; false without odometry."""
     (x0, y0, theta0), (x1, y1, theta1) = before.T_odom_base.tolist(), after.T_odom_base.tolist()
     return hypot(x1 - x0, y1 - y0) < STILL_M and abs(remainder(theta1 - theta0, tau)) < STILL_RAD
