@@ -17,7 +17,7 @@ from fcslam.robot.frontend3d import RobotFrontend3d
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
 from tests.live.same_thread import SameThread
-from tests.spinning_lidar import circle, drive, room
+from tests.spinning_lidar import PERIOD_S, circle, drive, room
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,26 @@ def test_a_robot_that_drove_far_while_its_lidar_paused_begins_a_session(moved_m:
 
 @pytest.fixture(scope="module")
 def straight() -> list:
-    return list(drive(room(1), lambda t: np.array([2.0 + t, 4.0 + 0.1 * np.sin(t), 0.1 * np.cos(t)]), 60, azimuths=120))
+    return list(drive(room(1), path, 60, azimuths=120))
+
+
+def path(t: float) -> np.ndarray:
+    return np.array([2.0 + t, 4.0 + 0.1 * np.sin(t), 0.1 * np.cos(t)])
+
+
+@pytest.mark.parametrize("wheels", [True, False])
+@pytest.mark.parametrize("late", [0.0, 0.5, 1.0])
+def test_the_first_motion_is_right_wherever_in_a_turn_its_stamp_is(wheels: bool, late: float) -> None:
+    robot, packets, shift_s = RobotFrontend3d("anna", SessionConfig()), [], late * PERIOD_S
+    for scan, _ in drive(room(1), path, 8, azimuths=240):
+        stamped = replace(scan, stamp=scan.stamp + shift_s, times_s=scan.times_s - np.float32(shift_s))
+        packets += robot.process(stamped if wheels else replace(stamped, wheels=scan.wheels[:0]))
+    assert robot.scan_poses.T_odom_base()[0] == pytest.approx(se3.IDENTITY, abs=1e-6)
+    first = next(packet.body for packet in packets if isinstance(packet.body, Constraint))
+    stamps = [packet.body.stamp for packet in packets if isinstance(packet.body, Keyscan)]
+    poses = np.array([se3.from_plane(path(stamp)) for stamp in stamps[:2]])
+    error = se3.log(se3.between(first.T_i_j, se3.between(*poses)))
+    assert np.abs(error[:2]).max() < 0.02
 
 
 def jump(by: tuple[float, float, float]) -> Callable[[np.ndarray], np.ndarray]:

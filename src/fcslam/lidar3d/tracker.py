@@ -81,7 +81,7 @@ class _Fit(NamedTuple):
 
 
 class Tracker3d:
-    """Gives each turn its pose in ``odom``, the frame of the robot at the first."""
+    """Gives each turn its pose in ``odom``, the frame of the robot at the stamp of the first."""
 
     def __init__(self) -> None:
         self.sensors = MotionSensors()
@@ -123,6 +123,9 @@ class Tracker3d:
         begin_s = scan.stamp + first_s
         shares = (times - first_s) / length_s
         T_odom_begin, self._covariance, predicted = self._predicted(begin_s, length_s, points, shares)
+        share = -first_s / length_s
+        if not self._turns:  # the pose at the stamp is the origin, whatever the motion before
+            T_odom_begin = se3.inverse(_interpolated(se3.IDENTITY, np.zeros((2, 6)), predicted.poses, share))
         deskewed = _deskew(points, shares, predicted.poses)
         chosen = thinned(deskewed, SIZES_M[-1], MOST_POINTS)
         fit = self._fitted(deskewed[chosen], shares[chosen], T_odom_begin, predicted)
@@ -143,7 +146,6 @@ class Tracker3d:
                 self.sensors.velocity = se3.log(se3.between(self._T_odom_end, end)) / since_s
         self._turns += 1
         self._T_odom_end, self._end_s = end, begin_s + length_s
-        share = -first_s / length_s
         at_stamp = _interpolated(T_odom_begin, fit.corrections, predicted.poses, share)
         in_odom = se3.transform(T_odom_begin, _corrected(deskewed, shares, fit.corrections))
         self._insert(in_odom, se3.transform(at_stamp, scan.origin_m[None])[0], motion)
