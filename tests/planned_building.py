@@ -40,26 +40,26 @@ STEP_M = 0.5
 CELL_M, MARGIN_M, THICKNESS_M = 0.02, 0.5, 0.12
 
 
-def outlines(walls):
-    """The walls as rectangles, shape (N, 4, 2)."""
+def outlines(walls, thickness_m=THICKNESS_M):
+    """The walls as rectangles, shape (N, 4, 2), all of one thickness, or each of its own, shape (N, 1)."""
     start, end = walls[:, :2], walls[:, 2:]
-    along = 0.5 * THICKNESS_M * (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
+    along = 0.5 * thickness_m * (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
     across = np.column_stack((-along[:, 1], along[:, 0]))
     ends = start - along, end + along
     return np.stack((ends[0] - across, ends[1] - across, ends[1] + across, ends[0] + across), axis=1)
 
 
-def sides(walls):
+def sides(walls, thickness_m=THICKNESS_M):
     """The sides of these rectangles as segments, shape (4 N, 4)."""
-    corners = outlines(walls)
+    corners = outlines(walls, thickness_m)
     return np.concatenate((corners, np.roll(corners, -1, axis=1)), axis=2).reshape(-1, 4)
 
 
-def plan_of(walls=WALLS):
+def plan_of(walls=WALLS, thickness_m=THICKNESS_M):
     low, high = walls.reshape(-1, 2).min(axis=0) - MARGIN_M, walls.reshape(-1, 2).max(axis=0) + MARGIN_M
     columns, rows = np.ceil((high - low) / CELL_M).astype(int)
     cells = np.full((rows, columns), Occupancy.FREE, np.uint8)
-    for corners in outlines(walls):
+    for corners in outlines(walls, thickness_m):
         cv2.fillPoly(
             cells, [np.round(((corners - low) / CELL_M - 0.5) * 16).astype(np.int32)], int(Occupancy.OCCUPIED), shift=4
         )
@@ -79,11 +79,11 @@ def ranges_at(pose, walls):
     return ranges(pose, walls, LASER)[0]
 
 
-def mapped(T_map_building=(3.0, -2.0, 0.6), scale=1.0, walls=WALLS, drift_rad=0.0):
+def mapped(T_map_building=(3.0, -2.0, 0.6), scale=1.0, walls=WALLS, drift_rad=0.0, thickness_m=THICKNESS_M):
     """The result of one robot in ``walls``, in another frame, with all lengths ``scale`` times too long, and with a
     heading that drifts over the drive."""
     true = true_poses()
-    rng, seen = np.random.default_rng(0), sides(walls)
+    rng, seen = np.random.default_rng(0), sides(walls, thickness_m)
     keyscans = tuple(
         Keyscan(
             KeyscanId("anna", k), float(k),

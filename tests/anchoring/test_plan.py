@@ -47,6 +47,16 @@ def test_lines_of_any_width_are_walls():
         assert off_m(placed(result, wide), true).max() < 0.05
 
 
+@pytest.mark.parametrize(("outer_m", "inner_m"), [(0.4, 0.12), (0.6, 0.12), (0.6, 0.3), (0.8, 0.5), (0.6, 0.6)])
+@pytest.mark.parametrize("by_hand", [False, True])
+def test_walls_of_two_thicknesses_fit_their_plan(outer_m, inner_m, by_hand):
+    thickness_m = np.where(np.arange(len(WALLS)) < 6, outer_m, inner_m)[:, None]  # the first six are the facade
+    result, true = mapped((1.1, 2.9, 0.02) if by_hand else (3.0, -2.0, 0.6), thickness_m=thickness_m)
+    placing = placed(result, plan_of(thickness_m=thickness_m), {0} if by_hand else ())
+    assert report_of(placing)["aligned"]
+    assert off_m(placing, true).max() < 0.05
+
+
 def test_a_plan_drawn_by_hand_places_the_map_and_leaves_its_shape():
     result, _ = mapped()
     by_hand = WALLS + 0.08 * np.sin(2.0 * np.pi * WALLS[:, [1, 0, 3, 2]] / 9.0)

@@ -33,7 +33,7 @@ LEAST_SHARE: Final = 0.3
 LEAST_RIVAL_M: Final = 0.4 * LEAST_SURFACE_M
 """Score of an alignment elsewhere that is always assumed."""
 USUAL_WALL_M: Final = 0.08
-"""Half of the width of a wall: wider lines are first taken for walls of this width."""
+"""Half of the width of a wall: wider lines that fit no map as they are drawn are taken for walls of this width."""
 MOST_THICKNESS_M: Final = ON_SURFEL_M
 """Walls that differ in thickness by less on each side are drawn as lines of another width, or as one line."""
 
@@ -83,12 +83,19 @@ def align_to_plan(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAli
     It is looked for from all positions, at headings that make walls parallel. A map that is ``placed`` lies
     about there in the plan already, and no other place is looked for.
     """
+    tries, wider_m = [_aligned(plan, building, placed)], plan.half_width_m - USUAL_WALL_M
+    if wider_m > 0.0 and tries[0] is not None and tries[0].refusal:
+        tries.append(_aligned(replace(plan, thickness_m=-wider_m), building, placed))
+    return max(filter(None, tries), key=lambda each: (not each.refusal, each.surface_m), default=None)
+
+
+def _aligned(plan: BuildingPlan, building: Submap, placed: bool) -> PlanAlignment | None:
+    """The best alignment with a plan whose walls are about as thick as it says."""
     # SciPy's transforms take long to load.
     from fcslam.lidar.uniqueness import align_map, best_alignment, is_elsewhere, parallel_headings
 
     if not len(building.surface):
         return None
-    plan = replace(plan, thickness_m=min(0.0, USUAL_WALL_M - plan.half_width_m))
     target = plan.submap
     if placed:
         best, lead = align_map(target, building, np.zeros(3)), np.inf
