@@ -53,7 +53,7 @@ A running service answers these HTTP requests for its state, maps and edits. `ma
 | 403 | the role or the robot does not match |
 | 404 | the requested item does not exist |
 | 409 | two processes with one robot name, two packets with one number, an existing mission, or a final edit |
-| 413 | the request exceeds 1 MiB |
+| 413 | the request is too large |
 | 429 | too many requests; `Retry-After` says when to try again |
 | 503 | the service is stopping, or it is not ready |
 | 507 | the disk is full; the service writes a requested result when there is room again |

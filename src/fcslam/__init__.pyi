@@ -34,6 +34,7 @@ from fcslam.records import CameraImage as CameraImage
 from fcslam.records import CameraModel as CameraModel
 from fcslam.records import Channel as Channel
 from fcslam.records import ClosureStatus as ClosureStatus
+from fcslam.records import CloudScan as CloudScan
 from fcslam.records import GnssFix as GnssFix
 from fcslam.records import LaserModel as LaserModel
 from fcslam.records import LaserScan as LaserScan
@@ -52,6 +53,9 @@ from fcslam.runs import Metric as Metric
 from fcslam.runs import RobotTrajectory as RobotTrajectory
 from fcslam.runs import Run as Run
 from fcslam.runs import open_run as open_run
+from fcslam.runs.verdict import Concern as Concern
+from fcslam.runs.verdict import MapVerdict as MapVerdict
+from fcslam.runs.verdict import Use as Use
 from fcslam.sources import BagOptions as BagOptions
 from fcslam.sources import Fault as Fault
 from fcslam.sources import FaultCount as FaultCount

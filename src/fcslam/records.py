@@ -84,7 +84,7 @@ class LaserModel:
     angle_min_rad: float
     angle_increment_rad: float
     max_range_m: float
-    """A range at or above it means no return."""
+    """A range at or above it is invalid."""
     T_base_laser: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Mounting pose, metres and radians."""
 
@@ -173,7 +173,7 @@ class LaserScan:
 
     stamp: float
     ranges_m: Ranges
-    """Shape (beam_count,). NaN: invalid; at or above ``laser.max_range_m`` (or inf): no return."""
+    """Shape (beam_count,). NaN, or at or above ``laser.max_range_m``: invalid; inf: no return."""
     laser: LaserModel
     """Its laser, with the beams of this scan."""
     T_odom_base: FloatArray

@@ -14,10 +14,12 @@ import os
 import sqlite3
 import stat
 import struct
+import sys
 import warnings
 import zipfile
 import zlib
 from collections.abc import Callable
+from importlib import import_module
 from itertools import repeat
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
@@ -25,6 +27,7 @@ from typing import Any, BinaryIO, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
+zstd = import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 ZSTD: Final = b"\x28\xb5\x2f\xfd"
 """The first bytes of a file or message in zstd."""
 MOST_BYTES: Final = 1 << 31
@@ -123,8 +126,6 @@ def open_unpacked(path: Path) -> BinaryIO:
     elif magic.startswith(b"BZh"):
         unpacking = bz2.BZ2File(file)
     elif magic.startswith(ZSTD):
-        from backports import zstd
-
         unpacking = zstd.open(file, "rb")
     else:
         return file
@@ -216,11 +217,11 @@ def _decompressor(compression: str) -> Any:
         from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 
         return LZ4FrameDecompressor()
-    if compression == "zstd":
-        from backports.zstd import ZstdDecompressor
-
-        return ZstdDecompressor()
-    plain: dict[str, Callable[[], Any]] = {"zlib": zlib.decompressobj, "bz2": bz2.BZ2Decompressor}
+    plain: dict[str, Callable[[], Any]] = {
+        "zlib": zlib.decompressobj,
+        "bz2": bz2.BZ2Decompressor,
+        "zstd": zstd.ZstdDecompressor,
+    }
     return plain[compression]()
 
 

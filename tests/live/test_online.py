@@ -293,6 +293,7 @@ def test_a_server_that_is_away_is_told_once_and_what_waits_is_kept(scans, tmp_pa
             while not network.requests:
                 pause.wait(0.001)
         assert not robot.finish(timeout_s=5.0)
+    assert not robot.finish(), "a closed robot sends nothing, so it does not wait"
     assert [event.kind for event in events] == [EventKind.OFFLINE]
     back.set()
     wiring = Wiring(SameThread(), transport=network)

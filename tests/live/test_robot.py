@@ -234,6 +234,7 @@ def test_the_number_of_beams_may_vary_from_scan_to_scan():
         ({"ranges_m": np.ones(90)}, r"ranges_m: shape \(90,\), but the laser has about 180 beams"),
         ({"ranges_m": "far"}, "ranges_m: not an array of numbers"),
         ({"stamp": math.nan}, "stamp: nan is not a time"),
+        ({"stamp": "1.0"}, "stamp: 1.0 is not a time"),
         ({"odometry": (0.0, 0.0)}, "odometry: .* is not a pose"),
         ({"odometry": (0.0, math.nan, 0.0)}, "odometry: .* is not a pose"),
         ({"laser": "rear"}, "laser 'rear' is not known"),
@@ -279,7 +280,19 @@ def test_nothing_comes_after_the_end(robot, scans):
         drive(robot, scans[3:4])
     with pytest.raises(InputError, match="the robot is finished"):
         robot.add(scans[3])
+    with pytest.raises(InputError, match="the robot is finished"):
+        robot.change_floor("2")
     assert len(robot.trajectory().stamps) == 3
+
+
+def test_a_closed_robot_waits_for_no_output_that_was_cancelled(scans):
+    executor = SameThread()
+    with fcslam.Robot("anna", scans[0].laser, own_map=False, wiring=Wiring(executor)) as robot:
+        drive(robot, scans[:20])
+        executor.holds = True
+        drive(robot, scans[20:])
+    robot._frontend.packets.newest.cancel()
+    assert len(robot.trajectory().stamps) == len(scans)
 
 
 def test_another_thread_may_ask_meanwhile(scans):

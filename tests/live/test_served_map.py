@@ -113,11 +113,11 @@ def test_a_folder_with_something_else_stays_as_it_is(floors, tmp_path):
 
 
 def test_a_run_of_its_own_stays_as_it_is(floors, tmp_path):
+    """Also one without a mission file, as of a robot that was localized."""
     run_of([(building(40), "")]).save(tmp_path / "mine")
-    (tmp_path / "mine" / "mission.fcslam").write_bytes(b"packets")
     with pytest.raises(InputError, match="mine: is a run"):
         fetch_maps(tmp_path / "mine", Server(floors))
-    assert (tmp_path / "mine" / "mission.fcslam").read_bytes() == b"packets"
+    assert read_map(tmp_path / "mine" / "map.yaml").cells.shape == (40, 40)
 
 
 def test_a_map_that_the_cloud_draws_anew_meanwhile_is_read_again(floors, tmp_path, monkeypatch):

@@ -218,4 +218,4 @@ def _fcslam(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Multi-robot 2D LiDAR SLAM: map the recordings of several robots together."""
+    """Multi-robot LiDAR SLAM: map the recordings of several robots together."""

@@ -11,7 +11,7 @@ import typer
 from fcslam.cli.inputs import bag_options, named_path
 from fcslam.cli.options import Sensors
 from fcslam.cli.output import notices
-from fcslam.errors import printable
+from fcslam.errors import InputError, printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -37,6 +37,8 @@ def info(
     """List what is in a recording, and whether it can be mapped. If not, say why and exit with code 1."""
     from fcslam.sources.inspection import inspect
 
+    if as_json and calibrate:
+        raise InputError("--json has no calibration; leave out --json or --calibrate")
     options = bag_options(sensors)
     found = _with_contradictions(inspect(named_path(recording)[0], options), options)
     if as_json:

@@ -102,7 +102,11 @@ def checked_image(image: ArrayLike, stamp: float, T_odom_base: FloatArray | None
 
 def checked_stamp(stamp: float, newest_s: float) -> float:
     """A stamp, seconds."""
-    if not math.isfinite(stamp):
+    try:
+        is_time = math.isfinite(stamp)
+    except TypeError:
+        is_time = False
+    if not is_time:
         raise InputError(f"stamp: {stamp} is not a time; give seconds")
     if stamp < newest_s - MAX_STEP_BACK_S:
         raise InputError(

@@ -7,8 +7,8 @@ beside it, which is another process, so no pose waits for it.
 import math
 import shutil
 from collections.abc import Callable, Mapping
-from concurrent.futures import BrokenExecutor, Executor, wait
-from contextlib import ExitStack, closing
+from concurrent.futures import BrokenExecutor, Executor
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -199,6 +199,7 @@ class Robot(LiveTracker):
         """
         _check_floor(floor)
         with self._lock:
+            self._require_unfinished()
             self._frontend.change_floor(floor)
 
     def status(self) -> RobotStatus:
@@ -344,7 +345,7 @@ class Robot(LiveTracker):
         uplink = self._uplink
         if uplink is None:
             return True
-        while (uplink.unstored or uplink.outbox.waiting.packets) and self._clock() < until_s:
+        while (uplink.unstored or uplink.outbox.waiting.packets) and self._clock() < until_s and not self._is_closed:
             self._wait_once(watch)
         self._raise_failure()
         return not uplink.unstored and not uplink.outbox.waiting.packets
@@ -367,7 +368,7 @@ class Robot(LiveTracker):
         that adds records faster than a robot.
         """
         self._raise_failure()
-        while self._is_behind():
+        while self._is_behind() and not self._is_closed:
             self._wait_once(watch)
 
     def save(self, folder: StrPath, force: bool = False) -> Run:
@@ -463,7 +464,8 @@ class Robot(LiveTracker):
         with self._lock:
             output = self._frontend.packets.newest
         if output is not None:
-            wait([output])
+            with suppress(Exception):  # it is told elsewhere; ``wait`` would wait for a cancelled output for ever
+                output.exception()
         with self._lock:
             self._take(self._frontend.ready())
 

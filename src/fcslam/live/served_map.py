@@ -10,8 +10,8 @@ import numpy as np
 from fcslam.errors import CloudError, InputError, SourceError, UnavailableError
 from fcslam.maps.occupancy_map import area_of, map_stem, parse_map
 from fcslam.records import FloatArray, frozen
-from fcslam.runs import RobotTrajectory, Run, prepare_output
-from fcslam.runs.folder import MISSION, is_run_folder
+from fcslam.runs import RobotTrajectory, Run, open_run, prepare_output
+from fcslam.runs.folder import is_run_folder
 from fcslam.wire.fleet_client import FleetClient
 from fcslam.wire.fleet_replies import ServedMap
 from fcslam.wire.http_transport import addresses
@@ -29,7 +29,7 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
     Returns:
         None; or why the cloud cannot be reached, if ``folder`` holds an earlier copy, which then stays as it is.
     """
-    if (folder / MISSION).exists():
+    if is_run_folder(folder) and _has_poses(open_run(folder, maps=False)):
         raise InputError(f"{folder}: is a run folder, not a copy of a cloud's maps; give another folder")
     prepare_output(folder, force=True)
     troubles = []
@@ -46,6 +46,11 @@ def fetch_maps(folder: Path, server: Server) -> str | None:
     return trouble
 
 
+def _has_poses(run: Run) -> bool:
+    """Whether it is no copy of a cloud's maps: their poses stay in the cloud."""
+    return bool(run.localized) or any(len(track.stamps) for track in run.trajectories.values())
+
+
 def _read(client: FleetClient, server: str) -> Run:
     for _ in range(_ATTEMPTS):
         served = [one for one in client.maps() if one.extent_m is not None]
@@ -57,7 +62,6 @@ def _read(client: FleetClient, server: str) -> Run:
             for suffix in ("yaml", *["ply"] * one.in_space, "pgm")
         }
         if all(_fits(one, files, server) for one in served):
-            # The poses stay in the cloud.
             poses: tuple[FloatArray, FloatArray] = frozen(np.empty(0)), frozen(np.empty((0, 3)))
             trajectories = {
                 robot: RobotTrajectory(robot, one.number, *poses, one.floor) for one in served for robot in one.robots

@@ -62,7 +62,7 @@ class LiveTracker(ABC):
         self._pose: RobotPose | None = None
         self._determined_s = -math.inf
         """Stamp of the newest scan that fixed the position; infinity after the event that none does."""
-        self._is_finished = False
+        self._is_finished = self._is_closed = False
         self._facing: defaultdict[tuple[float, float, float], list[LaserScan]] = defaultdict(list)
         self._examined: deque[Future[FloorLine | Contradiction | None]] = deque()
         """What the worker finds wrong with each laser: it takes as long as hundreds of scans."""
@@ -142,7 +142,7 @@ class LiveTracker(ABC):
 
         A second call does nothing.
         """
-        self._is_finished = True
+        self._is_finished = self._is_closed = True
         self._stack.close()
 
     @property
@@ -150,9 +150,12 @@ class LiveTracker(ABC):
         return len(self._frontend.tracks) - 1
 
     def _processed(self, record: SensorRecord) -> list[Packet]:
+        self._require_unfinished()
+        return self._frontend.process(record)
+
+    def _require_unfinished(self) -> None:
         if self._is_finished:
             raise InputError(f"{self.name}: the robot is finished; make a new Robot to go on")
-        return self._frontend.process(record)
 
     def _odometry(self, given: ArrayLike | None) -> FloatArray:
         if self._pose is not None and (given is None) is not (self._pose.T_odom_base is None):

@@ -6,18 +6,13 @@ A tile has ``TILE`` by ``TILE`` cells, four to a byte, compressed by zstd. Tile 
 import hashlib
 import json
 import secrets
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
+from fcslam.untrusted import zstd
 
 TILE: Final = 64
 """Cells on each side."""

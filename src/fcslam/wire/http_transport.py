@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
-from fcslam.errors import CloudError, OversizeError, PacketError, UnavailableError
+from fcslam.errors import CloudError, InputError, OversizeError, PacketError, UnavailableError
 from fcslam.records import MOST_NETWORK_BYTES, Channel
 from fcslam.wire.batches import (
     AGENT_HEADER,
@@ -69,7 +69,10 @@ class HttpClient:
 
     def __init__(self, server: Server, headers: Mapping[str, str] | None = None) -> None:
         """Open a client of a cloud; requests have the headers."""
-        import httpx
+        try:
+            import httpx
+        except ModuleNotFoundError as error:
+            raise InputError("a server needs httpx; install it: pip install 'fcslam[service]'") from error
 
         self._urls = deque(address.rstrip("/") for address in addresses(server.url))
         for address in self._urls:

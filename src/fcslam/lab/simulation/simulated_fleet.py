@@ -108,7 +108,7 @@ class SimulationSettings(Settings):
         default=Building.DEFAULT, description="kind of building: flat, default, office or corridor"
     )
     robots: int = Field(default=3, ge=1, description="number of robots")
-    path_length_m: float = Field(default=60.0, gt=0.0, description="length of each robot's path [m]")
+    path_length_m: float = Field(default=60.0, gt=0.0, le=10_000.0, description="length of each robot's path [m]")
     lighting: tuple[Lighting, ...] = Field(
         default=(Lighting.DAY,), min_length=1, description="lighting of each robot in turn: day, evening or lamp-off"
     )

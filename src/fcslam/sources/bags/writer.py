@@ -63,8 +63,7 @@ def write_bag(path: Path, records: Iterable[SensorRecord]) -> None:
 
     Header stamps are the records' own, to the nanosecond; the time of recording only ever grows. A scan whose beams
     were measured at different times has the stamp of the first one measured; if that is its last beam, the scan is
-    written clockwise. Ranges of the maximum or more are inf, no return. The motion during a scan is not written, as it
-    follows from the odometry.
+    written clockwise. The motion during a scan is not written, as it follows from the odometry.
 
     Raises:
         InputError: the bag cannot be written, its kind is not known, or ROS has no such stamp.
@@ -185,7 +184,7 @@ class _Bag:
     def _scan(self, header: Any, scan: LaserScan) -> Any:
         count, first_rad, increment_rad = scan.laser.beams
         last_rad = first_rad + scan.laser.beams.span_rad
-        ranges_m = np.where(scan.ranges_m >= scan.laser.max_range_m, np.float32(np.inf), scan.ranges_m)
+        ranges_m = scan.ranges_m
         beam_s = 0.0 if scan.sweep is None else scan.sweep.duration_s / (count - 1)
         if scan.sweep is not None and scan.sweep.last_s < scan.sweep.first_s:
             first_rad, last_rad, increment_rad, ranges_m = last_rad, first_rad, -increment_rad, ranges_m[::-1]

@@ -32,7 +32,7 @@ from fcslam.sources.pose import LARGEST_COORDINATE, Pose
 from fcslam.untrusted import check_unpacked
 
 SICK_MAX_RANGE_M = 50.0
-"""SICK scanners send it, or more, for no return."""
+"""SICK scanners send it, or more, where they measure nothing: it is invalid."""
 _LONGEST_RANGE_M = 1e6
 
 _RAW, _SCAN = (
