@@ -54,7 +54,7 @@ def info(
 
 
 def _with_contradictions(found: "Inspection", options: "BagOptions | None") -> "Inspection":
-    from fcslam.robot.calibrating import bodies_of, contradictions_of
+    from fcslam.robot.calibrating import bodies_of, contradictions_of, ramps_of
     from fcslam.sources import open_source
 
     if found.robots:
@@ -62,7 +62,7 @@ def _with_contradictions(found: "Inspection", options: "BagOptions | None") -> "
     if found.problem is not None:
         return found
     source = open_source(found.path, options)
-    return replace(found, notes=(*found.notes, *contradictions_of(source), *bodies_of(source)))
+    return replace(found, notes=(*found.notes, *contradictions_of(source), *bodies_of(source), *ramps_of(source)))
 
 
 def _calibration(recording: Path, options: "BagOptions | None") -> "Iterator[str]":

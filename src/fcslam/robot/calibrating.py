@@ -152,6 +152,20 @@ def bodies_of(source: Source) -> tuple[str, ...]:
     )
 
 
+def ramps_of(source: Source) -> tuple[str, ...]:
+    """A line about ramps over which a robot drives, by the clouds that are its scans."""
+    if (bag := bag_of(source)) is None:
+        return ()
+    stamps = [stamp for laser in bag.plan.lasers if laser.is_level for stamp in bag.plan.scans.bends(laser.topic)]
+    if not stamps:
+        return ()
+    begin_s, end_s = (stamp - bag.plan.lasers[0].first.stamp for stamp in (min(stamps), max(stamps)))
+    return (
+        f"{bag.path}: the robot drives over a ramp between {begin_s:.0f} s and {end_s:.0f} s, and a 2D map is wrong "
+        "there; map with --3d",
+    )
+
+
 def _scans_of(laser: LaserModel, source: Source) -> Iterator[LaserScan]:
     return (each for each in source.records() if isinstance(each, LaserScan) and is_same_laser(each.laser, laser))
 
@@ -253,7 +267,7 @@ def calibrated(source: Source, config: LidarConfig) -> Source:
     if radius_m > bag.options.cloud_band.body_radius_m:
         bag = bag.without_body(radius_m + SAME_M)
     found = calibrate_bag(bag, config)
-    lines = tuple(f"{bag.path}: {line}" for line in found.lines)
+    lines = (*ramps_of(bag), *(f"{bag.path}: {line}" for line in found.lines))
     return bag.corrected(found.correction, lines) if lines else bag
 
 

@@ -10,10 +10,11 @@ at the mean time of all.
 """
 
 from collections.abc import Iterable
-from math import ceil, cos, pi, radians, tau
+from math import atan2, ceil, cos, pi, radians, tau
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from fcslam.geometry import se2
@@ -57,6 +58,11 @@ _GOOD_MOUNTING = 0.8
 _FITS = 2
 _LEAST_EXTENT_M = 0.15
 """Least standard deviation of the points of a floor in every direction."""
+
+_BEND_RAD: Final = radians(3.0)
+"""A floor whose slope changes by less is flat."""
+_BEND_CLOUDS: Final = 9
+"""Clouds whose middle slope counts, and after which a robot has driven over a bend."""
 
 LARGEST_BODY_M: Final = 1.5
 """Farther returns are not of the robot."""
@@ -225,6 +231,30 @@ def floor_in(points: FloatArray, mounting: CloudMounting, largest_tilt_rad: floa
     height_m = float(normal @ mounting.position_m) - distance_m
     is_off = mounting.is_height_known and abs(height_m - mounting.position_m[2]) > FLOOR_ERROR_M
     return None if is_off or height_m < 0.0 else floor
+
+
+def slopes_of(points: FloatArray, mounting: CloudMounting) -> tuple[float, float]:
+    """Slopes of the floor along x ahead of ``base`` and behind it; 0 where it is as the mounting says, or not seen."""
+    x, y = points[:, 0], np.abs(points[:, 1])
+    floors = [floor_in(points[part], mounting) for part in (x > 2.0 * y, x < -2.0 * y)]
+    ahead_rad, behind_rad = (0.0 if floor is None else -atan2(floor[0][0], floor[0][2]) for floor in floors)
+    return ahead_rad, behind_rad
+
+
+def bends_in(slopes: FloatArray) -> NDArray[np.int64]:
+    """Rows of ``slopes_of`` the clouds of a drive, shape (N, 2), where the robot drives over a bend of the floor.
+
+    The floor is bent by the same angle before, at, and after it, and the slopes ahead and behind change by that angle.
+    A robot that nods or is mounted otherwise sees no bend, and one that turns in front of a ramp sees none meanwhile.
+    """
+    if len(slopes) < 3 * _BEND_CLOUDS:
+        return np.empty(0, np.int64)
+    usual = np.median(sliding_window_view(slopes, _BEND_CLOUDS, axis=0), axis=-1)
+    half = _BEND_CLOUDS // 2
+    states = np.array([usual[first : len(usual) - 4 * half + first] for first in (0, 2 * half, 4 * half)])
+    bends, pitched = states[..., 0] - states[..., 1], (states[0] - states[2]).T
+    is_bend = [(each > _BEND_RAD).all(axis=0) | (each < -_BEND_RAD).all(axis=0) for each in (bends, pitched)]
+    return np.flatnonzero(is_bend[0] & is_bend[1]) + 3 * half
 
 
 def _lowest_plane(points: FloatArray, is_height_known: bool, largest_tilt_rad: float) -> Plane | None:

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from itertools import islice
 from math import acos, degrees
 
+import numpy as np
+
 from fcslam.errors import SourceError
 from fcslam.sources.bags.camera import Calibration, calibration_of
 from fcslam.sources.bags.census import BagMessage, valid
@@ -23,7 +25,16 @@ from fcslam.sources.bags.topics import calibration_beside
 from fcslam.sources.bags.transforms import NoTransformError, TransformTree, is_corrected, is_odom
 from fcslam.sources.clouds_in_space import CloudReader, reader_of
 from fcslam.sources.gate import FIRST_MESSAGES
-from fcslam.sources.point_clouds import CloudMounting, PointCloud, directions_in, leaning, scan_of_cloud, unit_problem
+from fcslam.sources.point_clouds import (
+    CloudMounting,
+    PointCloud,
+    bends_in,
+    directions_in,
+    leaning,
+    scan_of_cloud,
+    slopes_of,
+    unit_problem,
+)
 
 _CLOUDS_TRIED = 10 * FIRST_MESSAGES
 """First clouds over which those are spread that show the floor and the directions of the sensor."""
@@ -81,6 +92,15 @@ class CloudScans:
         if not first:
             raise SourceError(f"{where}: no cloud can be read; correct the driver, or copy the bag again")
         return reader_of(first, self._mounting(topic, first[0].frame), self._options.cloud_band, where)
+
+    def bends(self, topic: Topic) -> list[float]:
+        """Stamps of the clouds of a topic at which the robot drives over a bend of the floor."""
+        stamps, slopes = [], []
+        for cloud in valid(self._robot.bag.read([topic]), self.cloud):
+            mounting = self._mounting(topic, cloud.frame)
+            stamps.append(cloud.stamp)
+            slopes.append(slopes_of(mounting.in_base(cloud), mounting))
+        return [stamps[k] for k in bends_in(np.array(slopes))]
 
     def _mounting(self, topic: Topic, frame: str) -> CloudMounting:
         """Where the sensor with this frame sits, corrected by the floor that it sees."""
