@@ -234,6 +234,8 @@ def _report(robot: "Robot", state: Path, server: str) -> None:
         trajectory = robot.trajectory()
         write_tum(state / "trajectory.tum", trajectory.stamps, trajectory.poses)
         typer.echo(f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}")
+    else:
+        typer.echo("no correction came before the end, so there is no trajectory.tum; the result of the service has it")
 
 
 class PlaybackPace:
