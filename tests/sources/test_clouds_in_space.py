@@ -10,6 +10,8 @@ import pytest
 from fcslam.errors import SourceError
 from fcslam.records import CloudScan, LaserScan, Odometry
 from fcslam.sources import BagOptions, open_fleet
+from fcslam.sources.clouds_in_space import reader_of
+from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud
 from tests.sources.bag_messages import ROS2, Said, odom, quaternion, save, scan, tf
 from tests.sources.clouds import VELODYNE, Measured, cloud, header, rotation, said, spinning, xyz
 from tests.sources.test_bag_clouds import START, pose_at
@@ -134,6 +136,22 @@ def test_what_is_wrong_with_clouds_is_said_in_one_line(tmp_path, changes, note):
     if "no floor" not in note:
         assert (np.abs(first.points_m[:, 2]) < 0.05).mean() > 0.05
     assert float(np.ptp(first.times_s)) == pytest.approx(0.1, abs=0.02)
+
+
+@pytest.mark.parametrize("height_m", [0.3, 0.7])
+@pytest.mark.parametrize("rings", [16, 64])
+@pytest.mark.parametrize("is_upside_down", [False, True])
+def test_a_lidar_that_is_upside_down_is_found_at_any_height(height_m, rings, is_upside_down):
+    R, at = rotation(roll=np.pi * is_upside_down), (0.0, 0.0, height_m)
+    points = [
+        spinning(lambda times, t=t: pose_at(t + times), at, R, rings, 180).points for t in np.arange(0.0, 1.0, 0.1)
+    ]
+    clouds = [PointCloud(0.1 * number, "lidar", each, np.empty(0)) for number, each in enumerate(points)]
+    reader, notes = reader_of(clouds, CloudMounting(np.eye(3), np.array(at), 0.0), CloudBand(), "/points")
+    assert [note.partition(", so ")[2] for note in notes] == is_upside_down * [
+        "the LiDAR is upside down; corrected: correct it in tf"
+    ]
+    assert reader.mounting.rotation == pytest.approx(R)
 
 
 def pcd(points, kind):

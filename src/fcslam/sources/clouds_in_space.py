@@ -40,12 +40,10 @@ FEWEST_ON_FLOOR: Final = 6
 """Points of a floor, at least."""
 _LEAST_EXTENT_M, _THICKEST_M = 0.3, 0.04
 """Least standard deviation of the points of a floor in every direction, and the largest along its normal."""
-_BELOW_SHARE, _OPENINGS = 0.1, 10.0
-"""A LiDAR that is mounted otherwise sees more points below the floor than this share; as it is, this many times fewer.
-"""
 _FEW_FLOORS: Final = 0.1
-"""Of its clouds, at most this share shows a floor where the mounting has it. Of a right mounting, at least 0.2 do, and
-fewer points are below."""
+"""If at most this share of the clouds shows a floor where the mounting has it, this is wrong; else 0.2 or more do."""
+_FEW_BELOW, _MANY_BELOW = 0.02, 0.1
+"""Points below the floor: a LiDAR upside down sees more than the first share; mounted otherwise, than the second."""
 
 
 class CloudRecording(ABC):
@@ -152,16 +150,15 @@ def reader_of(
     if not mounting.is_height_known:
         mounting = _on_floor(first, mounting) or mounting._replace(is_height_known=True)
     flipped = mounting._replace(rotation=np.diag([1.0, -1.0, -1.0]) @ mounting.rotation)
-    (on_floor, below), (on_other, below_other) = _shares(first, mounting), _shares(first, flipped)
-    if below > _BELOW_SHARE > _OPENINGS * below_other and on_other > _FLOOR_SHARE:
+    on_floor, below = _shares(first, mounting)
+    is_off = _floors(first, mounting) <= _FEW_FLOORS
+    if is_off and below > _FEW_BELOW and _floors(first, flipped) > 0.5:
         mounting = flipped
         notes.append(
             f"{where}: many points are below the floor, so the LiDAR is upside down; corrected: correct it in tf"
         )
     elif (on_floor < _FLOOR_SHARE and not any(floor_in(mounting.in_base(cloud), mounting) for cloud in first)) or (
-        below > _BELOW_SHARE
-        and sum(floor_at(mounting.in_base(cloud), FLOOR_REACH_M) is not None for cloud in first)
-        <= _FEW_FLOORS * len(first)
+        is_off and below > _MANY_BELOW
     ):
         notes.append(
             f"{where}: no floor is seen where the mounting has it, so maps are levelled by the IMU, or else as the "
@@ -199,6 +196,11 @@ def _on_floor(first: Sequence[PointCloud], mounting: CloudMounting) -> CloudMoun
         return None
     position = mounting.position_m + np.array([0.0, 0.0, float(np.median(heights_m))])
     return mounting._replace(position_m=position, is_height_known=True)
+
+
+def _floors(first: Sequence[PointCloud], mounting: CloudMounting) -> float:
+    """Share of the clouds that show a floor where the mounting has it."""
+    return float(np.mean([floor_at(mounting.in_base(cloud), FLOOR_REACH_M) is not None for cloud in first]))
 
 
 def _shares(first: Sequence[PointCloud], mounting: CloudMounting) -> tuple[float, float]:
