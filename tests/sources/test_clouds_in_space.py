@@ -118,7 +118,7 @@ def test_clouds_that_cannot_be_mapped_are_refused_in_one_line(tmp_path, changes,
 @pytest.mark.parametrize(
     ("changes", "note"),
     [
-        ({"layout": (12, xyz())}, "have no times, or all the same"),
+        ({"layout": (12, xyz())}, "have no times in a usual unit; their order gives them$"),
         ({"layout": timed(lambda measured: 0.1 * measured.times)}, "contradict how the LiDAR turns; their order gives"),
         ({"layout": timed(lambda measured: shuffled(measured.times))}, "contradict how the LiDAR turns"),
         ({"R": rotation(roll=np.pi)}, "the LiDAR is upside down; corrected"),
@@ -148,7 +148,8 @@ def test_a_lidar_that_is_upside_down_is_found_at_any_height(height_m, rings, is_
     ]
     clouds = [PointCloud(0.1 * number, "lidar", each, np.empty(0)) for number, each in enumerate(points)]
     reader, notes = reader_of(clouds, CloudMounting(np.eye(3), np.array(at), 0.0), CloudBand(), "/points")
-    assert [note.partition(", so ")[2] for note in notes] == is_upside_down * [
+    said = [note for note in notes if "have no times" not in note]
+    assert [note.partition(", so ")[2] for note in said] == is_upside_down * [
         "the LiDAR is upside down; corrected: correct it in tf"
     ]
     assert reader.mounting.rotation == pytest.approx(R)
@@ -199,6 +200,33 @@ def test_folders_of_clouds_are_recordings(tmp_path, kind):
     assert scans[3].origin_m[2] == pytest.approx(0.4, abs=0.02)
     with pytest.raises(SourceError, match="map them with --3d"):
         open_fleet([(Path(tmp_path), "anna")])
+
+
+@pytest.mark.parametrize(
+    ("names", "stamps"),
+    [
+        (
+            ["1700000000.050000", "1700000000.150000", "1700000000.950000"],
+            [1700000000.05, 1700000000.15, 1700000000.95],
+        ),
+        (["9.95", "10.05", "10.85"], [9.95, 10.05, 10.85]),
+        (["1700000000", "1700000001", "1700000002"], [1700000000.0, 1700000001.0, 1700000002.0]),
+        (["1700000000050", "1700000000150", "1700000000950"], [1700000000.05, 1700000000.15, 1700000000.95]),
+        (["8", "9", "10"], None),
+        (["0", "100", "200"], None),
+        (["scan_8", "scan_9", "scan_10"], None),
+    ],
+)
+def test_names_of_clouds_give_their_times_or_a_notice_says_what_is_assumed(tmp_path, names, stamps):
+    for x, name in enumerate(names):
+        points = spinning(pose_at, LIDAR, columns=90).points + np.array([0.1 * x, 0.0, 0.0])
+        (tmp_path / f"{name}.ply").write_bytes(ply(points, "ascii"))
+    (source,) = open_fleet([(Path(tmp_path), "anna")], IN_3D)
+    scans = list(source.records())
+    assert [each.stamp for each in scans] == pytest.approx([0.0, 0.1, 0.2] if stamps is None else stamps, abs=1e-4)
+    assert np.diff([float(each.points_m[:, 0].max()) for each in scans]) == pytest.approx(0.1, abs=1e-3)
+    said = [note for note in source.survey().notes if "count as 0.1 s apart; write one each to times.txt" in note]
+    assert len(said) == (stamps is None)
 
 
 def test_a_broken_file_is_left_out_and_times_must_be_there(tmp_path):

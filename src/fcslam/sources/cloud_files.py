@@ -1,10 +1,11 @@
 """Reads folders of clouds of a 3D LiDAR, one file each turn: KITTI (.bin), PCD and PLY, in the order of their names.
 
 Times come from ``times.txt`` or ``timestamps.txt`` in the folder or above it, one for each file; else from the names of
-the files, in seconds, microseconds or nanoseconds; else turns are 0.1 s apart. Without a known mounting, ``base`` is on
-the floor below the LiDAR.
+the files, in seconds with a point, or since 1970 in any usual unit; else turns are 0.1 s apart. Without a known
+mounting, ``base`` is on the floor below the LiDAR.
 """
 
+import re
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import cached_property
@@ -31,8 +32,10 @@ SUFFIXES: Final = (".bin", ".pcd", ".ply")
 _TIME_FILES: Final = ("times.txt", "timestamps.txt")
 _PERIOD_S: Final = 0.1
 _MOST_BYTES: Final = 32 * MOST_POINTS
-_UNITS: Final = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (0.0, 1.0))
-"""Least stamp in each unit, and the unit in seconds."""
+_LEAST_TIME: Final = 1e8
+"""Smaller names without a point are numbers of files."""
+_UNITS: Final = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
+"""Least stamp in each unit, and the unit in seconds; smaller ones are seconds."""
 _PLY_TYPES: Final = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -44,8 +47,8 @@ def cloud_files(folder: Path) -> list[Path]:
     """The clouds in a folder, or in that of KITTI below it; empty: it has none."""
     for place in (folder, folder / "velodyne", folder / "velodyne_points" / "data", folder / "data"):
         for suffix in SUFFIXES if place.is_dir() else ():
-            if files := sorted(place.glob(f"*{suffix}")):
-                return files
+            if files := list(place.glob(f"*{suffix}")):
+                return sorted(files, key=_in_order)
     return []
 
 
@@ -58,6 +61,11 @@ class CloudFolder(CloudRecording):
 
     @cached_property
     def _stamps(self) -> list[float]:
+        return self._times or [_PERIOD_S * number for number in range(len(self._files))]
+
+    @cached_property
+    def _times(self) -> list[float]:
+        """Of the clouds; empty: nothing gives them."""
         above = (self._files[0].parent, self._files[0].parent.parent, self.path)
         for file in (place / name for place in above for name in _TIME_FILES):
             if file.is_file():
@@ -72,21 +80,21 @@ class CloudFolder(CloudRecording):
         try:
             numbers = [float(file.stem) for file in self._files]
         except ValueError:
-            numbers = []
-        if len(numbers) > 1 and numbers[-1] - numbers[0] > 1.5 * len(numbers):  # more than a number of each file
-            unit_s = next(unit_s for least, unit_s in _UNITS if numbers[0] >= least)
-            return [number * unit_s for number in numbers]
-        return [_PERIOD_S * number for number in range(len(self._files))]
+            return []
+        if not min(numbers) > _LEAST_TIME and not any("." in file.stem for file in self._files):
+            return []
+        unit_s = next((unit_s for least, unit_s in _UNITS if numbers[0] >= least), 1.0)
+        return [number * unit_s for number in numbers]
 
     @cached_property
     def _reader(self) -> tuple[CloudReader, tuple[str, ...]]:
         first = [self._cloud(number) for number in range(len(self._files))[:FIRST_MESSAGES]]
         mounting = CloudMounting(np.eye(3), np.zeros(3), 0.0, is_height_known=False)
         reader, notes = reader_of(first, mounting, CloudBand(), str(self.path))
-        if reader.is_timed:
-            return reader, notes
-        order = "their order gives them" if reader.period_s else "the motion in a turn is not corrected: drive slowly"
-        return reader, (f"{self.path}: the points have no times; {order}", *notes)
+        if not self._times:
+            assumed = f"nothing gives their times, so they count as {_PERIOD_S:g} s apart; write one each to times.txt"
+            notes = (f"{self.path}: {assumed}", *notes)
+        return reader, notes
 
     def _cloud(self, number: int) -> PointCloud:
         return read_cloud(self._files[number], self._stamps[number])
@@ -104,6 +112,11 @@ class CloudFolder(CloudRecording):
                 yield number + 1, reader.scan(self._cloud(number), nothing[:, :4], nothing)
             except (SourceError, ValueError):
                 audit.add(Fault.BROKEN_MESSAGE, number + 1)
+
+
+def _in_order(file: Path) -> list[str | float]:
+    """Orders files by the numbers in their names, with as many digits as they have."""
+    return [float(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+(?:\.\d+)?)", file.stem))]
 
 
 def read_cloud(path: Path, stamp: float) -> PointCloud:

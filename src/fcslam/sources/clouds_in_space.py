@@ -147,6 +147,9 @@ def reader_of(
                 "unit of the times in the driver"
             )
     period_s = max(period_s, 0.0) if is_in_order else 0.0
+    if not any(len(cloud.times_s) for cloud in first):
+        order = "their order gives them" if period_s else "the motion in a turn is not corrected: drive slowly"
+        notes.append(f"{where}: the points have no times in a usual unit; {order}")
     if not mounting.is_height_known:
         mounting = _on_floor(first, mounting) or mounting._replace(is_height_known=True)
     flipped = mounting._replace(rotation=np.diag([1.0, -1.0, -1.0]) @ mounting.rotation)

@@ -118,7 +118,7 @@ class CloudScans:
                     f"the floor in {topic.name} leans by {degrees(acos(level[2, 2])):.0f} deg against the mounting of "
                     f"'{frame}'; corrected: correct it in tf"
                 )
-            notes += notes_on_times(topic.name, topic.type, clouds)
+            notes += notes_on_times(topic.name, topic.type, clouds, self.is_whole(topic))
             self.notes += [f"{label}{note}" for note in notes]
             self._mountings[topic, frame] = mounting._replace(directions=directions_in(clouds, mounting))
         return self._mountings[topic, frame]

@@ -139,13 +139,13 @@ def longest_cloud_s(headers: Iterable[tuple[float, str]]) -> float:
     return min(_OVER_INTERVAL * float(np.median(steps_s)), LONGEST_SWEEP_S) if len(steps_s) else LONGEST_SWEEP_S
 
 
-def notes_on_times(topic: str, kind: str, clouds: Sequence[PointCloud]) -> Iterator[str]:
-    """What is wrong with the times of the points in these clouds."""
+def notes_on_times(topic: str, kind: str, clouds: Sequence[PointCloud], is_whole: bool) -> Iterator[str]:
+    """What is wrong with the times of the points in these clouds, but that whole ones have none (``reader_of``)."""
     left_out = sum(cloud.left_out for cloud in clouds)
     if left_out:
         share = left_out / (left_out + sum(len(cloud.points) for cloud in clouds))
         yield f"{share:.1%} of the points of {topic} are left out, as their times are far from those of the others"
-    if kind != IMAGE and not any(len(cloud.times_s) for cloud in clouds):
+    if kind != IMAGE and not is_whole and not any(len(cloud.times_s) for cloud in clouds):
         is_in_order = any(cloud.is_in_order for cloud in clouds)
         times = "times that are no seconds and count as their order" if is_in_order else "no times, or all the same"
         yield (
