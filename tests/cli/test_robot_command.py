@@ -13,6 +13,8 @@ import yaml
 from rich.console import Console
 
 from fcslam.cli import live, main
+from fcslam.cli.inputs import open_recording
+from fcslam.cli.output import notices
 from fcslam.cli.play import robot_watch
 from fcslam.cli.progress import ProgressDisplay
 from fcslam.errors import CloudError, InputError
@@ -85,6 +87,11 @@ def test_a_2d_recording_in_3d_is_told_what_its_laser_does(log, cloud, tmp_path, 
     assert main([*play, "--resume"]) == 0
     err = capsys.readouterr().err.replace("\n", " ")
     assert err.count("alice: no point clouds, so its laser joins the 3D map") == 1
+
+
+def test_a_laser_that_is_localized_in_a_3d_map_joins_nothing(log, capsys):
+    open_recording(str(log), None, notices(), in_3d=True)
+    assert "joins" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

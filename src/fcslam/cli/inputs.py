@@ -76,7 +76,7 @@ def open_recording(
 
     With ``lidar``, a bag is calibrated, as before it is mapped.
     """
-    from fcslam.sources import BagOptions, open_source, planar_note, whole_clouds
+    from fcslam.sources import BagOptions, open_source, whole_clouds
 
     path, name = named_path(argument)
     options = bag_options(sensors)
@@ -88,7 +88,7 @@ def open_recording(
         with compiled(console, in_3d):
             source = calibrated(source, lidar)
     survey = source.survey()
-    print_notes(console, [*survey.notes, *filter(None, [planar_note([source]) if in_3d else ""])])
+    print_notes(console, survey.notes)
     return source, survey
 
 

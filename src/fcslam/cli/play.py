@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fcslam.cli.inputs import open_recording, print_faults
+from fcslam.cli.inputs import open_recording, print_faults, print_notes
 from fcslam.cli.options import (
     STATE,
     Budget,
@@ -74,6 +74,7 @@ def play(
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
     from fcslam.records import CloudScan
+    from fcslam.sources import planar_note
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
 
@@ -83,7 +84,9 @@ def play(
         raise InputError("a recording is played to a service; give --server, or map it here with `fcslam map`")
     pace = PlaybackPace(speed, time.monotonic, time.sleep)
     console = notices(quiet)
-    opened, survey = open_recording(recording, sensors, console, settings.fleet.dimensions == 3, settings.robot.lidar)
+    in_3d = settings.fleet.dimensions == 3
+    opened, survey = open_recording(recording, sensors, console, in_3d, settings.robot.lidar)
+    print_notes(console, filter(None, [planar_note([opened]) * in_3d]))
     try:
         check_robot(opened.name)
     except PacketError as error:
