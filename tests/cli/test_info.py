@@ -2,10 +2,12 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from fcslam.cli import main
 from tests.sources.bag_messages import drive, save, scan
+from tests.sources.clouds import at_rest, spinning
 
 pytestmark = pytest.mark.slow
 
@@ -35,6 +37,23 @@ def test_what_cannot_be_mapped_ends_with_the_reason(tmp_path, capsys):
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("cannot be mapped: ")
     assert "no laser scans" in last
+
+
+def test_a_folder_of_clouds_is_a_recording_that_can_be_mapped_with_3d(tmp_path, capsys):
+    for number in range(8):
+        points = spinning(at_rest, columns=90).points
+        (tmp_path / f"{number}.bin").write_bytes(np.column_stack((points, points[:, 0])).astype("<f4").tobytes())
+    assert main(["info", str(tmp_path), "--calibrate"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"{tmp_path}: folder of point clouds"
+    assert "8 scans in 0.7 s, path of 0.0 m by odometry" in lines
+    assert any("the points have no times in a usual unit; their order gives them" in line for line in lines)
+    assert not any(line.startswith("laser") for line in lines)
+    assert lines[-2:] == ["can be mapped with --3d", "calibration: of ROS bags only"]
+    for file in tmp_path.iterdir():
+        file.write_bytes(b"nonsense")
+    assert main(["info", str(tmp_path)]) == 1
+    assert "is not a cloud that can be read" in capsys.readouterr().out.splitlines()[-1]
 
 
 def test_names_of_a_bag_do_not_reach_the_terminal_as_they_are(tmp_path, capsys):

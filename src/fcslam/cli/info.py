@@ -35,12 +35,16 @@ def info(
     sensors: Sensors = None,
 ) -> None:
     """List what is in a recording, and whether it can be mapped. If not, say why and exit with code 1."""
+    from fcslam.sources import BagOptions
+    from fcslam.sources.formats import CLOUDS, format_of, robot_in
     from fcslam.sources.inspection import inspect
 
     if as_json and calibrate:
         raise InputError("--json has no calibration; leave out --json or --calibrate")
-    options = bag_options(sensors)
-    found = _with_contradictions(inspect(named_path(recording)[0], options), options)
+    path, options = named_path(recording)[0], bag_options(sensors)
+    if format_of(robot_in(path)[0]) == CLOUDS:
+        options = replace(options or BagOptions(), in_3d=True)
+    found = _with_contradictions(inspect(path, options), options)
     if as_json:
         typer.echo(json.dumps(asdict(found), default=str, indent=2, allow_nan=False))
     else:
@@ -95,6 +99,8 @@ def _calibration(recording: Path, options: "BagOptions | None") -> "Iterator[str
 
 
 def _lines(found: "Inspection") -> "Iterator[str]":
+    from fcslam.sources.formats import CLOUDS
+
     yield f"{found.path}: {found.format}"
     if found.bag is not None:
         yield "topics:"
@@ -126,7 +132,7 @@ def _lines(found: "Inspection") -> "Iterator[str]":
     if found.faults:
         yield f"faults: {found.faults}"
     yield from found.notes
-    yield "can be mapped"
+    yield f"can be mapped{' with --3d' * (found.format == CLOUDS)}"
 
 
 def _laser(laser: "LaserContents") -> str:

@@ -21,7 +21,7 @@ from fcslam.sources.source import Source
 if TYPE_CHECKING:
     from fcslam.sources.bags.rosbag import RosBag
 
-LOG, BAG = "CARMEN log", "ROS bag"
+LOG, BAG, CLOUDS = "CARMEN log", "ROS bag", "folder of point clouds"
 IN_PLANE = (
     "{}: no point clouds, so its laser joins the 3D map: it fixes x, y and heading where a robot with a 3D LiDAR saw "
     "the same walls, and needs level floors; without such a robot, leave out --3d"
@@ -124,14 +124,14 @@ def open_source(path: Path, options: BagOptions | None = None, name: str | None 
             are given for a recording that is not a bag.
     """
     path, robot = robot_in(Path(path))
-    if os.path.isdir(path) and not is_bag(path, b""):
-        from fcslam.sources.cloud_files import CloudFolder, cloud_files
+    known = format_of(path)
+    if known == CLOUDS:
+        from fcslam.sources.cloud_files import CloudFolder
 
-        if cloud_files(path):
-            if options is None or not options.in_3d:
-                raise SourceError(f"{path}: holds clouds of a 3D LiDAR; map them with --3d")
-            return CloudFolder(path, name or _robot_name(path))
-    if format_of(path) == LOG:
+        if options is None or not options.in_3d:
+            raise SourceError(f"{path}: holds clouds of a 3D LiDAR; map them with --3d")
+        return CloudFolder(path, name or _robot_name(path))
+    if known == LOG:
         if options not in (None, BagOptions(in_3d=True)) or robot is not None:
             raise SourceError(
                 f"{path}: a {LOG} has neither topics nor tf; --sensors and a robot after a colon go with ROS bags "
@@ -152,7 +152,7 @@ def _robot_name(path: Path) -> str:
 
 
 def format_of(path: Path) -> str:
-    """The format of the recording at ``path``, ``LOG`` or ``BAG``, by its content."""
+    """The format of the recording at ``path``, ``LOG``, ``BAG`` or ``CLOUDS``, by its content."""
     parts = parts_of(path)
     if len(parts) > 1 and not os.path.isdir(path):
         for part in parts:
@@ -170,6 +170,10 @@ def format_of(path: Path) -> str:
             return BAG
     known = f"{LOG} or {BAG}"
     if is_folder:
+        from fcslam.sources.cloud_files import cloud_files
+
+        if cloud_files(path):
+            return CLOUDS
         raise SourceError(f"{path}: is a folder, not a recording; give the file of a recording ({known})")
     if path.name == "metadata.yaml":
         raise SourceError(f"{path}: describes a bag; give its folder, {path.parent}")

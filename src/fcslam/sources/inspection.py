@@ -7,12 +7,12 @@ import numpy as np
 
 from fcslam.errors import SourceError
 from fcslam.geometry.beams import is_same_laser
-from fcslam.records import CameraImage, CameraModel, LaserModel, LaserScan, Odometry
+from fcslam.records import CameraImage, CameraModel, CloudScan, LaserModel, LaserScan, Odometry
 from fcslam.sources.bags.census import Messages
 from fcslam.sources.bags.codec import SCANS
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.bags.transforms import Link
-from fcslam.sources.formats import bag_of, format_of, open_source, robot_in
+from fcslam.sources.formats import bag_of, format_of, is_whole, open_source, robot_in
 from fcslam.sources.source import Source
 
 
@@ -102,7 +102,7 @@ def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
 
 def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -> Inspection:
     survey = source.survey()
-    by_laser: list[tuple[LaserModel, list[float]]] = [(laser, []) for laser in survey.lasers]
+    by_laser: list[tuple[LaserModel, list[float]]] = [] if is_whole(source) else [(each, []) for each in survey.lasers]
     scans = odometry = images = 0
     for record in source.records():
         match record:
@@ -112,6 +112,8 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
                     if is_same_laser(record.laser, laser):
                         own.append(record.stamp)
                         break
+            case CloudScan():
+                scans += 1
             case Odometry():
                 odometry += 1
             case CameraImage():
