@@ -48,6 +48,10 @@ _REMEMBERED_M: Final = 20.0
 """Travel after which surfaces that were not seen again are forgotten."""
 
 
+_Start = tuple[FloatArray, FloatArray, Prediction]
+"""Pose at the begin of a turn, its covariance (6, 6), and the motion during the turn, as they are predicted."""
+
+
 class Tracked(NamedTuple):
     """A turn of the LiDAR with its pose."""
 
@@ -122,13 +126,14 @@ class Tracker3d:
         length_s = max(last_s - first_s, 1e-3)
         begin_s = scan.stamp + first_s
         shares = (times - first_s) / length_s
-        T_odom_begin, self._covariance, predicted = self._predicted(begin_s, length_s, points, shares)
+        start = self._start(begin_s, length_s, points, shares)
+        T_odom_begin, self._covariance, predicted = start
         share = -first_s / length_s
         if not self._turns:  # the pose at the stamp is the origin, whatever the motion before
             T_odom_begin = se3.inverse(_interpolated(se3.IDENTITY, np.zeros((2, 6)), predicted.poses, share))
         deskewed = _deskew(points, shares, predicted.poses)
         chosen = thinned(deskewed, SIZES_M[-1], MOST_POINTS)
-        fit = self._fitted(deskewed[chosen], shares[chosen], T_odom_begin, predicted)
+        fit = self._fitted(deskewed[chosen], shares[chosen], start)
         begin = se3.compose(T_odom_begin, se3.exp(fit.corrections[0]))
         end = se3.compose(T_odom_begin, se3.compose(se3.exp(fit.corrections[1]), predicted.poses[-1]))
         to_end = se3.adjoint(se3.inverse(predicted.poses[-1]))
@@ -163,29 +168,22 @@ class Tracker3d:
             self._is_poor,
         )
 
-    def _predicted(
-        self, begin_s: float, length_s: float, points: FloatArray, shares: FloatArray
-    ) -> tuple[FloatArray, FloatArray, Prediction]:
-        """The pose at the begin of a turn with its covariance, and the motion during the turn: by the wheels, unless
-        constant velocity contradicts them and explains clearly more ``points``."""
-        found = self._prediction(begin_s, length_s)
-        if not self._turns or found[2].planar is None:
-            return found
-        other = self._prediction(begin_s, length_s, by_wheels=False)
-        ends = (se3.compose(begin, within.poses[-1]) for begin, _, within in (found, other))
-        if (np.abs(se3.log(se3.between(*ends))) < _CONTRADICTION).all():
-            return found
+    def _start(self, begin_s: float, length_s: float, points: FloatArray, shares: FloatArray) -> _Start:
+        """What is predicted by the wheels, unless constant velocity contradicts them and explains clearly more
+        ``points``."""
+        starts = by_wheels, other = [self._predicted(begin_s, length_s, by_wheels) for by_wheels in (True, False)]
+        ends = (se3.compose(begin, within.poses[-1]) for begin, _, within in starts)
+        if not self._turns or (np.abs(se3.log(se3.between(*ends))) < _CONTRADICTION).all():
+            return by_wheels
         on_surface = []
-        for begin, covariance, within in (found, other):
-            deskewed = _deskew(points, shares, within.poses)
+        for start in starts:
+            deskewed = _deskew(points, shares, start[2].poses)
             chosen = thinned(deskewed, SIZES_M[-1], MOST_POINTS)
-            fit = self._fit(deskewed[chosen], shares[chosen], begin, within, covariance, within.sigma)
-            on_surface.append(fit.on_surface / max(len(chosen), 1))
-        return other if on_surface[1] > on_surface[0] + _POOR_LEAST else found
+            on_surface.append(self._fit(deskewed[chosen], shares[chosen], start).on_surface / max(len(chosen), 1))
+        return other if on_surface[1] > on_surface[0] + _POOR_LEAST else by_wheels
 
-    def _prediction(
-        self, begin_s: float, length_s: float, by_wheels: bool = True
-    ) -> tuple[FloatArray, FloatArray, Prediction]:
+    def _predicted(self, begin_s: float, length_s: float, by_wheels: bool) -> _Start:
+        """The uncertainty grows from the end of the turn before to the begin of this one."""
         within = self.sensors.predict(begin_s + np.linspace(0.0, length_s, _STEPS + 1), by_wheels)
         gap_s = begin_s - self._end_s
         if not np.isfinite(gap_s):
@@ -198,39 +196,30 @@ class Tracker3d:
         covariance = back @ covariance @ back.T + np.diag(between.sigma**2)
         return se3.compose(self._T_odom_end, between.poses[-1]), covariance, within
 
-    def _fitted(self, points: FloatArray, shares: FloatArray, T_odom_begin: FloatArray, predicted: Prediction) -> _Fit:
+    def _fitted(self, points: FloatArray, shares: FloatArray, start: _Start) -> _Fit:
         if not self._turns:
             return _Fit(np.zeros((2, 6)), np.diag(np.tile(_MAP_SIGMA, 2) ** 2), np.zeros((6, 6)), 0, 1.0)
-        fit, sigma = partial(self._fit, points, shares, T_odom_begin, predicted), predicted.sigma
-        first = fit(self._covariance, sigma)
-        tries = [fit(self._covariance, sigma, tilt) for tilt in _JOLT_RAD * _JOLTS] if self._is_poor else []
-        best = max((first, *tries), key=lambda each: each.on_surface)
+        fit = partial(self._fit, points, shares)
+        tries = [fit(start, tilt) for tilt in (0.0, *(_JOLT_RAD * _JOLTS if self._is_poor else ()))]
+        best = max(tries, key=lambda each: each.on_surface)
         self._is_poor = self._turns > SETTLED and 1.0 - best.share > _POOR_FACTOR * (1.0 - self._usual) + _POOR_LEAST
         if self._is_poor:
-            loose = sigma.copy()
-            loose[3:5] = np.maximum(loose[3:5], _JOLT_RAD)
-            tilted = self._covariance.copy()
+            T_odom_begin, covariance, predicted = start
+            sigma, tilted = predicted.sigma.copy(), covariance.copy()
+            sigma[3:5] = np.maximum(sigma[3:5], _JOLT_RAD)
             tilted[4, 4] += _JOLT_RAD**2
-            tries = [fit(self._covariance, loose), *(fit(tilted, loose, tilt) for tilt in _JOLT_RAD * _JOLTS)]
-            return max((best, *tries), key=lambda each: each.on_surface)
+            loose = predicted._replace(sigma=sigma)
+            tries = [fit((T_odom_begin, tilted, loose), tilt) for tilt in _JOLT_RAD * _JOLTS]
+            return max((best, fit((T_odom_begin, covariance, loose)), *tries), key=lambda each: each.on_surface)
         self._usual += 2.0 / SETTLED * (best.share - self._usual)
         return best
 
-    def _fit(
-        self,
-        points: FloatArray,
-        shares: FloatArray,
-        T_odom_begin: FloatArray,
-        predicted: Prediction,
-        covariance: FloatArray,
-        sigma: FloatArray,
-        tilt: float = 0.0,
-    ) -> _Fit:
+    def _fit(self, points: FloatArray, shares: FloatArray, start: _Start, tilt: float = 0.0) -> _Fit:
+        T_odom_begin, covariance, predicted = start
         to_end = se3.adjoint(se3.inverse(predicted.poses[-1]))
-        start = np.array([0.0, 0.0, 0.0, 0.0, tilt, 0.0])
-        motion_information = to_end.T @ np.diag(sigma**-2) @ to_end
-        by_wheels = predicted.planar is not None
-        return _fit(self._map, points, shares, T_odom_begin, inverse(covariance), motion_information, start, by_wheels)
+        motion = to_end.T @ np.diag(predicted.sigma**-2) @ to_end
+        first, by_wheels = np.array([0.0, 0.0, 0.0, 0.0, tilt, 0.0]), predicted.planar is not None
+        return _fit(self._map, points, shares, T_odom_begin, inverse(covariance), motion, first, by_wheels)
 
     def _insert(self, points: FloatArray, origin: FloatArray, motion: FloatArray) -> None:
         tangent = se3.log(motion)
