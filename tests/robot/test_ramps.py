@@ -5,6 +5,7 @@ import pytest
 
 from fcslam.robot.calibrating import ramps_of
 from fcslam.sources import open_source
+from fcslam.sources.point_clouds import CloudMounting, slopes_of
 from tests.sources.bag_messages import odom, quaternion, save, tf
 from tests.sources.clouds import VELODYNE, Measured, cloud, rotation, said
 from tests.sources.test_bag_clouds import START
@@ -65,3 +66,13 @@ def test_no_ramp_is_named_on_a_flat_floor(tmp_path, kind, leaning_rad):
         turn = np.column_stack((np.full(20, FOOT_M - 0.7), np.linspace(0.0, np.pi, 20), np.zeros(20)))
         poses = np.vstack((poses, turn, poses[::-1] + np.array([0.0, np.pi, 0.0])))
     assert not ramps_of(bag_of(tmp_path, poses, kind != "turns", leaning_rad))
+
+
+def test_a_wall_with_little_floor_before_it_shows_no_slope():
+    corridor = seen(0.0, 0.0, 0.0, is_flat=True)
+    wall = np.array([(-2.6, y, z) for y in np.arange(-1.2, 1.2, 0.1) for z in np.arange(0.0, 1.0, 0.05)])
+    points = np.vstack((corridor[corridor[:, 0] > -2.6], wall))
+    mounting = CloudMounting(rotation(pitch=np.radians(4.0)), LIDAR, 0.0)
+    ahead_rad, behind_rad = slopes_of((points - LIDAR) @ mounting.rotation.T + LIDAR, mounting)
+    assert np.degrees(ahead_rad) == pytest.approx(-4.0, abs=0.5)
+    assert np.isnan(behind_rad)

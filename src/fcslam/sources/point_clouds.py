@@ -10,7 +10,7 @@ at the mean time of all.
 """
 
 from collections.abc import Iterable
-from math import atan2, ceil, cos, pi, radians, tau
+from math import atan2, ceil, cos, nan, pi, radians, tau
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -61,6 +61,8 @@ _LEAST_EXTENT_M = 0.15
 
 _BEND_RAD: Final = radians(3.0)
 """A floor whose slope changes by less is flat."""
+_BEND_M: Final = 0.8
+"""Standard deviation of the points of such a floor along x, at least; a wall with the floor before it has less."""
 _BEND_CLOUDS: Final = 9
 """Clouds whose middle slope counts, and after which a robot has driven over a bend."""
 
@@ -234,11 +236,17 @@ def floor_in(points: FloatArray, mounting: CloudMounting, largest_tilt_rad: floa
 
 
 def slopes_of(points: FloatArray, mounting: CloudMounting) -> tuple[float, float]:
-    """Slopes of the floor along x ahead of ``base`` and behind it; 0 where it is as the mounting says, or not seen."""
+    """Slopes of the floor along x ahead of ``base`` and behind it; NaN where it is not seen."""
     x, y = points[:, 0], np.abs(points[:, 1])
-    floors = [floor_in(points[part], mounting) for part in (x > 2.0 * y, x < -2.0 * y)]
-    ahead_rad, behind_rad = (0.0 if floor is None else -atan2(floor[0][0], floor[0][2]) for floor in floors)
+    ahead_rad, behind_rad = (_slope(points[part], mounting) for part in (x > 2.0 * y, x < -2.0 * y))
     return ahead_rad, behind_rad
+
+
+def _slope(points: FloatArray, mounting: CloudMounting) -> float:
+    normal, distance_m = floor_in(points, mounting) or (np.array([0.0, 0.0, 1.0]), 0.0)
+    own = points[np.abs(points @ normal - distance_m) < SAME_SURFACE_M]
+    is_seen = len(own) > _FEWEST_ON_FLOOR and float(np.std(own[:, 0])) > _BEND_M
+    return -atan2(normal[0], normal[2]) if is_seen else nan
 
 
 def bends_in(slopes: FloatArray) -> NDArray[np.int64]:
@@ -249,8 +257,10 @@ def bends_in(slopes: FloatArray) -> NDArray[np.int64]:
     """
     if len(slopes) < 3 * _BEND_CLOUDS:
         return np.empty(0, np.int64)
-    usual = np.median(sliding_window_view(slopes, _BEND_CLOUDS, axis=0), axis=-1)
+    windows = np.sort(sliding_window_view(slopes, _BEND_CLOUDS, axis=0), axis=-1)  # NaN is last
     half = _BEND_CLOUDS // 2
+    seen = np.isfinite(windows).sum(axis=-1, keepdims=True)
+    usual = np.where(seen > half, np.take_along_axis(windows, seen // 2, axis=-1), nan)[..., 0]
     states = np.array([usual[first : len(usual) - 4 * half + first] for first in (0, 2 * half, 4 * half)])
     bends, pitched = states[..., 0] - states[..., 1], (states[0] - states[2]).T
     is_bend = [(each > _BEND_RAD).all(axis=0) | (each < -_BEND_RAD).all(axis=0) for each in (bends, pitched)]
