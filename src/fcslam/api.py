@@ -56,8 +56,7 @@ def map_recordings(
 ) -> Run:
     """Map the recordings of several robots together, one robot per recording.
 
-    The same recordings, configuration and seed give the same run. Faults of a recording that do not keep it from being
-    mapped are logged as warnings.
+    The same recordings, configuration and seed give the same run. Lesser faults of a recording are logged as warnings.
 
     Args:
         recordings: one path, several, or a mapping of robot names to paths, in any known format. Without a mapping,
@@ -105,11 +104,7 @@ def map_recordings(
 
 
 def run_recordings(
-    recordings: Sequence[Source],
-    settings: MissionConfig,
-    inputs: MissionInputs,
-    processes: int,
-    watch: Watch,
+    recordings: Sequence[Source], settings: MissionConfig, inputs: MissionInputs, processes: int, watch: Watch
 ) -> Run:
     """Map opened recordings, ``processes`` robots at a time, after a check that none is there twice."""
     check_robots(recordings)

@@ -1,8 +1,7 @@
 """Compiled functions and the cache of their machine code, which works without a folder for it as well.
 
-Compiling takes half a minute, loading from the cache less than a second. The cache of an installed package is in the
-user's cache folder, that of a clone beside its sources; ``NUMBA_CACHE_DIR`` names another one. If no folder can be
-written, every process compiles.
+Compiling takes half a minute, loading from the cache less than a second. The cache is in the user's cache folder, or
+beside the sources of a clone; ``NUMBA_CACHE_DIR`` names another. If none can be written, every process compiles.
 """
 
 import fcntl

@@ -12,8 +12,7 @@ _SYSTEM_ERROR = re.compile(r"\[Errno -?\d+\] ([^:()]+)(?:: '([^']*)')?")
 class FcslamError(Exception):
     """Base class of all exceptions of fcslam.
 
-    In the message, an error of the operating system stands without its number, and without the file if the message
-    begins with that file.
+    In the message, an error of the operating system has no number, and no file if the message begins with that file.
     """
 
     def __init__(self, message: str) -> None:

@@ -77,8 +77,7 @@ class Beams(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LaserModel:
-    """Geometry of one 2D LiDAR. Its beams may vary from scan to scan (``geometry.beams.misfit``), the rest is constant
-    over a recording."""
+    """Geometry of one 2D LiDAR. Only its beams may vary from scan to scan (``geometry.beams.misfit``)."""
 
     beam_count: int
     angle_min_rad: float
@@ -181,8 +180,7 @@ class LaserScan:
     sweep: Sweep | None = None
     """None: all beams were measured at the stamp. The motion is that of the odometry; zeros without odometry."""
     on_teammates: NDArray[np.bool_] | None = None
-    """Beams that hit another robot of the fleet, shape (beam_count,): they stay in the scan, but no scan is matched by
-    them. None: none is known."""
+    """Beams that hit another robot, shape (beam_count,): they stay, but no scan is matched by them. None: not known."""
     new_floor: str = ""
     """Floor that the robot is on from this scan on, which a new session maps; empty: none is named."""
     gyro: FloatArray | None = None
@@ -715,8 +713,7 @@ class Correction:
     map_index: int
     """Identifies one of the maps that are not joined yet; it may change when maps join."""
     T_map_odom: FloatArray
-    """Shape (3,), or (7,) in space. Here, ``odom`` is the chain of the robot's motions between keyscans; its first
-    keyscan is zero."""
+    """Shape (3,), or (7,) in space. Here, ``odom`` is the chain of motions between keyscans; the first is zero."""
     quality: float = 0.0
     """Support by other sessions, in [0, 1]; 0 if no other session supports the pose. It is the agreement of the newest
     comparison with places of other sessions, times 1 - 2^-n with n places that closures connect to others. Both count

@@ -1,8 +1,7 @@
 """The one reader of files that may come from somebody else: recordings, runs, missions, maps, settings, networks.
 
-It opens regular files only, follows no link in a folder from outside, and limits what a file expands to. Errors are
-``OSError`` and ``ValueError``, which callers report with the file's name. ``tests/test_untrusted.py`` finds readers
-that bypass this module.
+It opens regular files only, follows no link in a folder from outside, and limits what a file expands to. Callers report
+``OSError`` and ``ValueError`` with the file's name. ``tests/test_untrusted.py`` finds readers elsewhere.
 """
 
 import bz2

@@ -143,8 +143,7 @@ def is_cold() -> bool:
 def compiling(processes: int) -> Iterator[Sequence[Background]]:
     """Run the warm-up of the first scans, then the others beside this block, in copies of this process.
 
-    The copies fill the cache and end with the context. Without a cache, or with one process, this process compiles the
-    rest when it needs it.
+    The copies fill the cache and end with the context. Without a cache or copies, the rest is compiled when needed.
     """
     first, *others = WARM_UPS
     first()

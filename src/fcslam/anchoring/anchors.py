@@ -118,8 +118,10 @@ def anchored(
     if result.sightings or anchors.survey is not None:
         files[TAGS_JSON] = _json({"tags": tags, "distances": distances, "surveyed": surveyed})
     if anchors.plan is not None:
-        files |= _rmf(anchors.plan, [r.floor for r in result.robots if reports[r.map_index]["aligned"]])
         drawing = anchors.plan.drawing
+        floors = [robot.floor for robot in result.robots if reports[robot.map_index]["aligned"]]
+        if floors:
+            files[RMF_YAML] = rmf_yaml(drawing, anchors.plan.is_picture, floors[0] or FIRST_LEVEL).encode()
         files[PLAN_JSON] = _json({"maps": reports, "drawing": outlines(drawing.cells == Occupancy.OCCUPIED, drawing)})
         files[PLAN_PNG] = _picture(drawing, pictures)
     return result, files
@@ -161,11 +163,6 @@ def _plan_report(k: int, alignment: "PlanAlignment", fit: "PlanFit") -> dict[str
         "residuals": [round(residual, 4) for residual in fit.residuals],
         "deviations": deviations,
     }
-
-
-def _rmf(plan: "BuildingPlan", floors: Sequence[str]) -> dict[str, bytes]:
-    """The file for Open-RMF, if robots on these floors are in maps that lie in the plan."""
-    return {RMF_YAML: rmf_yaml(plan.drawing, plan.is_picture, floors[0] or FIRST_LEVEL).encode()} if floors else {}
 
 
 def _json(content: object) -> bytes:

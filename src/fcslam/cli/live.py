@@ -79,10 +79,7 @@ def drive_live(
         if event.kind is not EventKind.CORRECTED:  # there are many
             notify(event.text)
 
-    with (
-        closing(open_network(live.address)) as network,
-        ExitStack() as stack,
-    ):
+    with closing(open_network(live.address)) as network, ExitStack() as stack:
         namespace = live.address.namespace
         topics = await_sensors(network, namespace, live.options, live.parameters.topic_timeout)
         for note in topics.notes:

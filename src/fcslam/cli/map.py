@@ -191,12 +191,7 @@ def _watch(display: "ProgressDisplay", total: int, faults: "dict[str, Faults]") 
     return watch
 
 
-def _report(
-    run: "Run",
-    elapsed_s: float,
-    output: Path,
-    earlier: "SavedMission",
-) -> None:
+def _report(run: "Run", elapsed_s: float, output: Path, earlier: "SavedMission") -> None:
     from rich.table import Table
 
     from fcslam.anchoring.anchors import anchoring_lines

@@ -33,8 +33,7 @@ class _TimeLeft(TimeRemainingColumn):
 class ProgressDisplay:
     """The stages of a command, with count, elapsed and remaining time each.
 
-    The display starts with the first stage, so a command may refuse bad input or start processes before. Its methods
-    may be called from any thread.
+    It starts with the first stage, so a command may refuse bad input or start processes before. Any thread may call.
 
     Args:
         console: where to show progress; nothing is shown if it is quiet.

@@ -71,8 +71,7 @@ def with_least_noise(constraint: Constraint) -> Constraint:
     """The constraint with the precision that scan matching has at best.
 
     Robots state no more: more points do not reduce the errors of matching that neighbouring points share, nor those of
-    the scanner's calibration (``least_sigmas``, ``CLOSURE_SIGMA_M``). So this changes only claims that are
-    false.
+    the scanner's calibration (``least_sigmas``, ``CLOSURE_SIGMA_M``). So only false claims change.
     """
     group, sigma_m, sigma_rad = group_of(constraint.T_i_j), CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
     if constraint.kind is ConstraintKind.ODOMETRY:

@@ -22,11 +22,7 @@ class Cloud(FleetHost):
     """The host of a fleet that keeps the packets in memory, and replies to them."""
 
     def __init__(
-        self,
-        config: FleetConfig,
-        seed: int,
-        verify_pairs: VerifyPairs = verify_here,
-        grid: OccupancyConfig = _GRID,
+        self, config: FleetConfig, seed: int, verify_pairs: VerifyPairs = verify_here, grid: OccupancyConfig = _GRID
     ) -> None:
         super().__init__(
             CloudConfig(seed=seed, fleet=config, map=grid), lambda number: self._packets[number], verify_pairs

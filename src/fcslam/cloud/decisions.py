@@ -145,7 +145,9 @@ class ClosureDecisions(Kept):
         self._waited += 1
         # The graph of a robot alone is solved once, at the end.
         if len(self._sessions.robots) > 1 and self._graph.is_due(self._config.solve_every):
-            self._optimize()
+            self._graph.optimize()
+            self._contested |= self._are_maps_refuted()
+            self.version += 1
         is_contested = self._contested and len(self.closures) >= int(CONTESTED_GROWTH * self._evaluated)
         sessions, new = len(self._sessions.robots), len(self.closures) - self._evaluated
         if is_contested or (self._joins and new >= sessions and self._waited >= PLACES_A_SESSION * sessions):
@@ -274,7 +276,9 @@ class ClosureDecisions(Kept):
         if b in self.map_of(a):
             self._contested |= self._is_contested(decision, entries)
         if decision.shortfall is not None:
-            _explain(entries, decision.shortfall.under(CONSISTENCY))
+            for entry in entries:
+                if entry.closure.status is ClosureStatus.VERIFIED:
+                    entry.set(ClosureStatus.VERIFIED, decision.shortfall.under(CONSISTENCY))
         else:
             self._joins |= any(entries[k].closure.status is not ClosureStatus.ACCEPTED for k in decision.members)
         self._due[pair] = int(DECIDED_GROWTH * len(entries)) + 1
@@ -285,11 +289,6 @@ class ClosureDecisions(Kept):
             entry.edge = self._graph.close(closure.i, closure.j, closure.T_i_j, closure.information)
         self._graph.count(entry.edge, holds=True)
         entry.set(ClosureStatus.ACCEPTED, reason)
-
-    def _optimize(self) -> None:
-        self._graph.optimize()
-        self._contested |= self._are_maps_refuted()
-        self.version += 1
 
     def _are_maps_refuted(self) -> bool:
         """Whether the maps of two joined sessions contradict each other by now: of those that have grown most.
@@ -321,12 +320,6 @@ def _separated(before: Sequence[Sequence[str]], after: Sequence[Sequence[str]]) 
         parts = [part for map_ in after if (part := [session for session in map_ if session in sessions])]
         pairs += list(combinations(parts, 2))
     return pairs
-
-
-def _explain(entries: Iterable[ClosureEntry], reason: Reason) -> None:
-    for entry in entries:
-        if entry.closure.status is ClosureStatus.VERIFIED:
-            entry.set(ClosureStatus.VERIFIED, reason)
 
 
 def measured(made: ManualClosure, i: Scans, j: Scans) -> tuple[FloatArray, FloatArray]:

@@ -81,8 +81,7 @@ class Fleet:
     def apply(self, packet: Packet) -> None:
         """Let one packet take effect: figure 1 of the paper, cloud side.
 
-        The packets of a session come in the order of their numbers, which ``PacketLog`` takes care of. Those of a
-        removed session have no effect.
+        ``PacketLog`` gives the packets of a session in the order of their numbers. A removed session has no effect.
 
         Raises:
             PacketError: it does not fit what its robot sent before; nothing has changed.

@@ -28,10 +28,7 @@ class FleetHost:
     """Owns a fleet: applies packets in their order, follows edits, and answers what the map of a session is."""
 
     def __init__(
-        self,
-        config: CloudConfig,
-        read: Callable[[PacketNumber], Packet],
-        verify_pairs: VerifyPairs = verify_here,
+        self, config: CloudConfig, read: Callable[[PacketNumber], Packet], verify_pairs: VerifyPairs = verify_here
     ) -> None:
         self._settings, self._read, self._verify_pairs = config, read, verify_pairs
         self.edits: tuple[Edit, ...] = ()

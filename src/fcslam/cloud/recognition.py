@@ -153,12 +153,7 @@ class PlaceRecognition:
         if key not in self._matchers:
             rng = np.random.default_rng(self._seed)
             self._matchers[key] = PlaceMatcher(
-                self._config.matcher,
-                self.submaps.of,
-                rng,
-                self._forget,
-                self.submaps.noise_of,
-                self._verify_pairs,
+                self._config.matcher, self.submaps.of, rng, self._forget, self.submaps.noise_of, self._verify_pairs
             )
         return self._matchers[key]
 
@@ -227,8 +222,7 @@ def visits_near(
 ) -> list[Visit]:
     """The visits of a session to the surroundings of a point (A,), in the plane or in space, in their order.
 
-    ``numbers``: of the keyscans of its places (N,), in their order, at the poses (N, P). Consecutive ones that are near
-    are one visit.
+    ``numbers``: of its places' keyscans (N,), ascending, at the poses (N, P). Near ones in a row are one visit.
     """
     distance = np.linalg.norm(T_map_place[:, : len(point)] - point, axis=1)
     close = np.flatnonzero(distance < within_m)
@@ -243,8 +237,7 @@ def visits_near(
 def worth_comparing(visits: Iterable[Sequence[Visit]], of_each: int, most: int) -> list[Visit]:
     """The visits of each robot that a new place is compared with: the nearest ones of different robots first.
 
-    ``of_each`` robot and ``most`` in all are taken. Closures to a few robots determine the pose relative to all others
-    that closures tie to them.
+    ``of_each`` robot and ``most`` in all are taken: closures to a few robots fix the pose relative to all tied to them.
     """
     nearest = (sorted(found)[:of_each] for found in visits)
     ranked = sorted((rank, visit) for found in nearest for rank, visit in enumerate(found))

@@ -124,8 +124,7 @@ def _join(pair: frozenset[str], evidence: ClusterEvidence) -> Join:
 def traffic_metrics(ledger: Ledger, tracks: Mapping[str, Track]) -> list[Metric]:
     """Packets and bytes by kind of message and channel of places, of the whole fleet; and by robot up and down.
 
-    Rates are over the time that a robot recorded, all its sessions together. A ledger that knows only one direction
-    says nothing about the other.
+    Rates are over the time that a robot recorded, in all sessions. A ledger of one direction says nothing of the other.
     """
     traffic = {str(kind): ledger.total(kind=kind) for kind in sorted({label.kind for label in ledger.accepted})}
     traffic |= {f"{channel}_{PacketKind.PLACE}": ledger.total(channel=channel) for channel in PLACE_CHANNELS}

@@ -55,8 +55,7 @@ class MappedRobot:
     T_map_base: FloatArray
     """Pose at each stamp, in the frame of its map, shape (N, 3)."""
     T_local_base: FloatArray
-    """Pose at each stamp, in the robot's own map, made without other robots, shape (N, 3); the origin is its
-    first keyscan."""
+    """Pose at each stamp in the robot's own map, made without others, shape (N, 3); the origin is its first keyscan."""
     variables: NDArray[np.int64]
     """Number of each keyscan in the result's pose graph, shape (N,)."""
     lasers: tuple[LaserModel, ...]

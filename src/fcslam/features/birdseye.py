@@ -43,8 +43,7 @@ Features = tuple[NDArray[np.float32], Codes]
 def describe(points: FloatArray, most: int = 400) -> Features:
     """Detect and describe the ``most`` strongest features of a submap; K = 0 if the picture has no corner.
 
-    The points (N, 2), in metres in the submap's coordinate frame, are one per 5-10 cm of wall. Those that are not
-    finite or outside the picture are ignored.
+    The points (N, 2), metres in the submap's frame, are one per 5-10 cm of wall; those not in the picture are ignored.
 
     OpenCV's thread count is not changed, because it belongs to the whole process. The features do not depend on it.
     """

@@ -102,8 +102,7 @@ def _offsets(scores: Probabilities, pixels: NDArray[np.int64]) -> NDArray[np.flo
 def box_nms(positions_px: ArrayLike, side_px: float) -> NDArray[np.int64]:
     """Rows (K,), ascending, of the keypoints that no box of a stronger one overlaps by more than ``MOST_OVERLAP``.
 
-    ``positions_px`` (N, 2) are finite, the strongest first. Suppressed keypoints suppress none. Boxes of side 0 keep
-    everything.
+    ``positions_px`` (N, 2) are finite, the strongest first. Suppressed keypoints suppress none; side 0 keeps all.
     """
     points = np.asarray(positions_px, np.float64).reshape(-1, 2)
     if side_px <= 0.0 or not len(points):

@@ -23,8 +23,7 @@ FLOOR_MARGIN_M: Final = 0.03
 NEIGHBOURS_M: Final = 0.20
 """Neighbouring returns closer than this lie on one surface."""
 SLANT: Final = 4.0
-"""Neighbouring returns also lie on one surface if they are closer than this many times the spacing of their beams at
-that range: a surface at a grazing angle."""
+"""Neighbouring returns are of one surface, at a grazing angle, up to this many times the spacing of beams there."""
 WIDEST_GAP: Final = 2.5
 """Largest gap between the returns of a surface, in beam spacings: one beam in between may fail."""
 EDGE_M: Final = 0.08

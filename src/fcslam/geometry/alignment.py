@@ -47,8 +47,7 @@ def two_point_alignment(points_a: ArrayLike, points_b: ArrayLike) -> Array:
 def n_point_alignment(points_a: ArrayLike, points_b: ArrayLike, weights: ArrayLike | None = None) -> Array:
     """Compute the least-squares ``T_a_b`` over matched points in closed form.
 
-    Minimises ``sum w |a - T_a_b b|^2`` (Umeyama 1991 without scale; in the plane the rotation is the angle of one
-    complex sum).
+    Minimises ``sum w |a - T_a_b b|^2`` (Umeyama 1991 without scale; here the rotation is the angle of a complex sum).
 
     Args:
         points_a: shape (..., N, 2), metres, in the coordinate frame a.

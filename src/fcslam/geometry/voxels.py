@@ -31,9 +31,8 @@ def voxelised(
 ) -> tuple[Steps, NDArray[np.uint8]]:
     """The middle of the points (N, 3), metres, in each voxel, and the scan that saw it.
 
-    ``scans`` (N,): of each point, as a row of ``origins_m`` (M, 3), where the scanner was. Of several scans, the one
-    that was nearest counts. Voxels are in ascending order, without those outside. Of more than ``MOST_POINTS`` voxels
-    the nearest ones are kept.
+    ``scans`` (N,): of each point, as a row of ``origins_m`` (M, 3), where the scanner was. The nearest of several scans
+    counts. Voxels ascend, without those outside; the nearest ``MOST_POINTS`` are kept.
     """
     low, high = (VOXEL_STEPS * STEP_M * np.array(corner) for corner in (LOWEST, END))
     kept = ((points_m >= low) & (points_m < high)).all(axis=1)

@@ -1,7 +1,6 @@
 """Linear least squares between pairs of variables: normal equations of square blocks, and their sparse factor L L^T.
 
-Every sum has its order, no library of linear algebra takes part, and one thread does the work: the same input gives the
-same bytes.
+Every sum has its order, without a library of linear algebra, in one thread: the same input gives the same bytes.
 """
 
 from functools import lru_cache

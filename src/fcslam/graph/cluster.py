@@ -86,9 +86,7 @@ def decide_cluster(
     settings: ConsistencySettings,
     examine: Examine = lambda *_: None,
 ) -> ClusterDecision:
-    """Decide whether the K closures from a to b have a dominant cluster; ``informative`` (K,): those that fix every
-    direction.
-    """
+    """Decide if K closures from a to b have a dominant cluster; ``informative`` (K,): which fix every direction."""
     consistent = pairwise_consistency(a, b, closures)
     positions = closure_positions(a, b, closures)
     return dominant_cluster(
@@ -112,9 +110,8 @@ def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArr
     """Estimate ``T_a_b`` (P,) of the frames of two trajectories from the two matched places that lie farthest apart.
 
     Implements eqs. (5)-(6) of FC-SLAM in the plane. If these places are too close to each other in a or b to fix a
-    rotation, the first closure alone gives the transform. Tags fix the heading worse than walls, so closures by tags
-    count only without others, and then all of them by their information. In space, two points fix no rotation, so all
-    closures count.
+    rotation, the first closure alone gives the transform. Tags fix the heading worse than walls, so they count only
+    without others, and then all of them by their information. In space, two points fix no rotation: all count.
     """
     group = group_of(closures.T_i_j)
     if group is not SE2:

@@ -1,8 +1,7 @@
 """Pairwise consistency of closures between two trajectories (PCM, Mangelson et al., ICRA 2018).
 
 Two closures are consistent if the loop that they form with the two stretches of trajectory between them closes, within
-the covariances of the closures and the drift of both stretches. The transform between the frames of the two
-trajectories plays no part.
+the covariances of the closures and the drift of both stretches. The transform between the two frames plays no part.
 """
 
 from dataclasses import dataclass, field
@@ -17,8 +16,7 @@ from fcslam.records import FloatArray
 _PAIRS_AT_ONCE = 100_000
 """Pairs of closures tested in one go: memory must not grow with the square of the number of closures."""
 SUPPORT_M = 10.0
-"""Largest path length between the ends of two closures, on both trajectories, at which consistent closures support
-each other, metres."""
+"""Largest path, metres, between the ends of two closures on both trajectories at which they support each other."""
 TAG_VIEWS = 2
 """Keyscans of each trajectory from which a tag must be seen to be evidence: a tag misread once is none."""
 

@@ -1,8 +1,7 @@
 """Initial poses of a graph without a good estimate, by chordal relaxation: two sparse linear systems.
 
-Rotations as complex numbers of any length minimise ``sum k |u_j - u_i e^(i theta_ij)|^2``; translations follow with
-the rotations held (Carlone et al., ICRA 2015, in the plane). In space, rotations are matrices, and the nearest rotation
-of each is taken.
+Rotations as complex numbers of any length minimise ``sum k |u_j - u_i e^(i theta_ij)|^2``; translations follow with the
+rotations held (Carlone et al., ICRA 2015, in the plane). In space, the nearest rotation of each matrix is taken.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,7 @@
 """Several robots in one graph: which robots share a map, which closures are inliers, and all poses.
 
-Most closures between robots may be false, and false ones may be consistent with one another. The transforms between
-the robots' frames are unknown. Pairwise consistency finds these transforms; graduated non-convexity then decides every
-closure.
+Most closures between robots may be false, and false ones may be consistent with one another. The transforms between the
+robots' frames are unknown. Pairwise consistency finds these; graduated non-convexity then decides every closure.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -34,8 +33,7 @@ ExaminePair = Callable[[int, int, Trajectory, Trajectory, Closures, MayDecide], 
 """As ``Examine``: it takes the numbers of the robots, their own trajectories, and the closures."""
 
 CompareJointMaps = Callable[[int, int, FloatArray, FloatArray], MapFit]
-"""Compares the maps of two robots at joint poses. It takes the numbers of the robots and the poses of their variables,
-shape (N, P) each."""
+"""Compares the maps of two robots at joint poses: takes their numbers and the poses of their variables, (N, P) each."""
 
 _Relation = tuple[int, int, FloatArray]
 """Two robots a and b, and the transform T_a_b between their own frames, shape (P,)."""
@@ -59,8 +57,7 @@ class JointEvidence:
     tags: NDArray[np.int64] | None = None
     """Per edge, shape (E,): number from 1 of the tag that both keyscans saw, 0 without one. None: no edge has one."""
     senders: tuple[int, ...] | None = None
-    """Sender of each robot's packets: the sessions of one sender count as one in the search for false bridges. None:
-    each robot is its own sender."""
+    """Sender of each robot's packets: its sessions count as one in the search for false bridges. None: each its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,9 +180,7 @@ def solve_jointly(
 
 
 def _solve_own_graph(
-    evidence: JointEvidence,
-    robot: NDArray[np.int64],
-    initial: FloatArray,
+    evidence: JointEvidence, robot: NDArray[np.int64], initial: FloatArray
 ) -> tuple[Trajectory, NDArray[np.int64]]:
     graph = evidence.graph
     number = np.full(len(graph), -1)
@@ -346,8 +341,7 @@ def _isolated_closures(
     """Inlier closures that no other closure supports and that alone constrain a stretch of the path, shape (E,).
 
     Only closures between robots most of whose closures are outliers: of many false closures, one may be consistent by
-    chance where the path is loose enough to follow it. There, an isolated closure counts only if the rest of the graph
-    predicts it.
+    chance where the path is loose enough to follow it. There, one counts only if the rest of the graph predicts it.
     """
     inliers = solution.weights > INLIER_WEIGHT
     loose = _distance_to_next_closure_m(evidence, own, inliers) >= separation_m
@@ -396,10 +390,7 @@ def is_confirmed(
 
 
 def _false_bridges(
-    evidence: JointEvidence,
-    solution: Solution,
-    senders: Sequence[int],
-    compare: CompareJointMaps,
+    evidence: JointEvidence, solution: Solution, senders: Sequence[int], compare: CompareJointMaps
 ) -> dict[tuple[int, int], Reason]:
     """Pairs of robots that must not share a map, because they alone join maps that contradict each other."""
     edges, (owner, _) = evidence.graph.arrays(), _owners(evidence)

@@ -43,12 +43,7 @@ class Solution:
     """Half the sum of the edges' losses at the poses."""
 
 
-def optimize(
-    graph: PoseGraph,
-    initial: ArrayLike | None = None,
-    *,
-    loss: Loss = Loss.SQUARED,
-) -> Solution:
+def optimize(graph: PoseGraph, initial: ArrayLike | None = None, *, loss: Loss = Loss.SQUARED) -> Solution:
     """Optimize a pose graph by Levenberg-Marquardt.
 
     Args:
@@ -64,10 +59,7 @@ def optimize(
     return steps.solution(loss.weights(chi2), steps.cost)
 
 
-def optimize_gnc(
-    graph: PoseGraph,
-    initial: ArrayLike | None = None,
-) -> Solution:
+def optimize_gnc(graph: PoseGraph, initial: ArrayLike | None = None) -> Solution:
     """Optimize under the truncated squared loss on closures: each ends at weight 1 (inlier) or 0 (outlier).
 
     Graduated non-convexity (Yang et al., RA-L 2020, truncated least squares, eqs. 12-14); odometry always counts.
@@ -83,11 +75,7 @@ def optimize_gnc(
     return _alternate(steps, (steps.chi2() <= steps.limit).astype(np.float64))
 
 
-def refine_inliers(
-    graph: PoseGraph,
-    initial: ArrayLike | None,
-    weights: ArrayLike,
-) -> Solution:
+def refine_inliers(graph: PoseGraph, initial: ArrayLike | None, weights: ArrayLike) -> Solution:
     """Alternate solving and deciding every closure by its residual, until no decision changes.
 
     The last part of ``optimize_gnc``, from closures that are trusted already: for graphs most of whose closures are
@@ -205,8 +193,7 @@ class PosePrior:
 def optimize_anchored(graph: PoseGraph, initial: FloatArray, priors: Sequence[PosePrior]) -> FloatArray:
     """Optimize a pose graph, all of whose edges count, with priors; returns poses (N, 3) in the frame of the priors.
 
-    The poses to start from, shape (N, 3), are in this frame, too. Each connected component has priors that fix its
-    pose.
+    The poses to start from, shape (N, 3), are in this frame, too. Priors fix the pose of each connected component.
     """
     # A prior is an edge from the origin of its frame, one more variable, which is held.
     edges, count = graph.arrays(), len(graph)

@@ -92,18 +92,14 @@ class EdgeArrays:
         return EdgeArrays(self.i[rows], self.j[rows], self.T_i_j[rows], self.information[rows], self.robust[rows])
 
 
-def _no_edges(group: Group) -> EdgeArrays:
-    ends, d = np.zeros(0, np.int64), group.freedom
-    return EdgeArrays(ends, ends, np.zeros((0, group.size)), np.zeros((0, d, d)), np.zeros(0, bool))
-
-
 class PoseGraph:
     """Variables with initial poses, shape (N, P), and edges between them; append-only."""
 
     def __init__(self, poses: ArrayLike = (), edges: Iterable[Edge] = (), group: Group = SE2) -> None:
         self.group = group
         self._poses = Rows(np.zeros((0, group.size)))
-        self._set_edges(_no_edges(group))
+        ends, d = np.zeros(0, np.int64), group.freedom
+        self._set_edges(EdgeArrays(ends, ends, np.zeros((0, group.size)), np.zeros((0, d, d)), np.zeros(0, bool)))
         for pose in np.asarray(poses, dtype=np.float64).reshape(-1, group.size):
             self.add_variable(pose)
         for edge in edges:

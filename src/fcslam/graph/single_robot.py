@@ -45,11 +45,7 @@ def solve_single_robot(graph: PoseGraph) -> Solution:
     first = optimize_gnc(supported_graph, initialize_robust(supported_graph))
     weights = np.zeros(len(robust))
     weights[supported] = first.weights
-    solutions = (
-        by_odometry,
-        refine_inliers(graph, first.poses, weights),
-        optimize_gnc(graph, odometry),
-    )
+    solutions = (by_odometry, refine_inliers(graph, first.poses, weights), optimize_gnc(graph, odometry))
     return min(solutions, key=lambda solution: solution.cost)
 
 

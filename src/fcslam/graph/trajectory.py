@@ -40,8 +40,7 @@ class Trajectory:
 def build_trajectory(poses: ArrayLike, step_covariance: ArrayLike | None = None) -> Trajectory:
     """Accumulate the covariance along a path of poses (N, P), that of ``DRIFT`` included.
 
-    ``step_covariance`` is that of each step in the tangent space at its end, shape (N - 1, d, d); None takes the steps
-    as exact.
+    ``step_covariance`` is that of each step in the tangent space at its end, (N - 1, d, d); None: steps are exact.
     """
     x = np.asarray(poses, dtype=np.float64)
     group, (sigma_m, sigma_rad) = group_of(x), DRIFT

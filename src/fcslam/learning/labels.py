@@ -90,8 +90,7 @@ def peaks(response: Response, nms_px: float, most: int) -> Points:
 def fuse_keypoints(first: Points, second: Points) -> Labels:
     """Fuse the keypoints of two detectors into one set, ranked by the mean of both ranks.
 
-    A point that both detectors found lies midway between theirs. One that a single detector found ranks last with the
-    other.
+    A point that both detectors found lies midway between theirs; one of a single detector ranks last with the other.
 
     Args:
         first, second: shape (N, 2) [px], strongest first.

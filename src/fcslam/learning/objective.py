@@ -145,8 +145,7 @@ def rehearsal_loss(described: Description, before: Description, points: Tensor) 
 def revisit_negatives(batch: RevisitBatch) -> Tensor:
     """Which valid points of a batch differ for certain, shape (V, V), bool.
 
-    Points of one pair differ if they are far apart in both views, and points of two pairs if they are far apart in the
-    map.
+    Points of one pair differ if they are far apart in both views, those of two pairs if they are so in the map.
     """
     valid = batch.valid
     first, second = (side[valid] for side in batch.points.chunk(2))

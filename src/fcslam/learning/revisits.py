@@ -1,7 +1,6 @@
 """Correspondences between two images of one place, from the poses that SLAM estimated and the keypoints' depth.
 
-A homography makes pairs of one image only. Two visits show the same points in other light, from another side, and with
-other furniture around them.
+A homography makes pairs of one image only. Two visits differ in light, side and the furniture around the points.
 
 Poses and depths are a few centimetres off, which is several pixels nearby. So the codes of the points that match anyway
 first tell how far the predicted pixels are off in each part of the image. Then geometry alone decides which keypoint is

@@ -55,8 +55,7 @@ class ExecutionOptions:
 
 
 ProgressCallback = Callable[[int, int, Mapping[str, float], tuple[str, ...]], None]
-"""Called with the steps done, all steps, the latest losses and validation metrics, and the warnings of the latest
-validation."""
+"""Called with the steps done, all steps, the latest losses and metrics, and the latest validation's warnings."""
 
 
 class TrainingRun:

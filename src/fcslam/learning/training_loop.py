@@ -149,8 +149,7 @@ class LocalTrainingPlan:
 
 
 LocalTrainingResult = tuple[KeypointNetwork, dict[str, float], dict[str, Tensor]]
-"""The network; the means of its losses over the steps; and the state of the optimizer, with which a later local
-training continues."""
+"""The network; the means of its losses; and the state of the optimizer, with which a later local training continues."""
 
 
 def local_training(

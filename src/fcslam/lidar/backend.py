@@ -21,8 +21,7 @@ SOLVE_AFTER_SHARE = 0.08
 the graph, so solves become rarer and the mean cost per scan stays constant."""
 
 DENSE_M = 50.0
-"""Travel from the beginning of a session along which submaps are twice as dense, metres: robots that have just met have
-few places to be joined by."""
+"""Travel from the beginning of a session with twice as dense submaps, metres: robots that just met have few places."""
 
 
 @dataclass(frozen=True, slots=True)

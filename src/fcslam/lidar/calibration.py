@@ -183,8 +183,7 @@ def _sweep_share(motions: ScanMotions, odometry: OdometryTrack, delay_s: float) 
 def _fit(moved: FloatArray, seen: FloatArray, turned: FloatArray) -> tuple[Estimate, Mounting, float]:
     """Linear least squares of ``(R_m - I) c' + m = R(g) b / s``, with c = s c' and C = (c, g).
 
-    Motions m and b between the same scans, shape (P, 3), are ``moved`` and ``seen``; R_m turns by ``turned``, shape
-    (P,).
+    Motions m and b between the same scans (P, 3) are ``moved`` and ``seen``; R_m turns by ``turned``, shape (P,).
     """
     cos, sin = np.cos(turned), np.sin(turned)
     rows_x = np.stack((1.0 - cos, sin, seen[:, 0], -seen[:, 1]), axis=1)

@@ -1,9 +1,8 @@
 """Loop closing inside one robot: a submap is compared with earlier ones that may show the same place.
 
 The error allowed for in the estimate grows with the shortest path through the pose graph (odometry and accepted
-closures), not with time: after a closure the search is narrow again. A wide search covers
-the whole window by branch and bound. Where the error may exceed the largest window, place recognition proposes the
-earlier submaps and the motions to them.
+closures), not with time: after a closure the search is narrow again. A wide search covers the whole window by branch
+and bound. Beyond the largest window, place recognition proposes submaps and motions.
 """
 
 from collections.abc import Collection, Sequence
@@ -27,8 +26,7 @@ NARROW_M = 2.0 * ALIGNMENT_SCALE_M
 """Up to this drift allowance the prediction itself starts the alignment, and the loose gate is enough."""
 DISTANCE_PENALTY = 0.2
 ANGLE_PENALTY = 0.5 * DISTANCE_PENALTY
-"""Shares of a search's score that are lost at the edges of its window: of equal poses, the one near the prediction
-counts."""
+"""Shares of a search's score lost at the edges of its window: of equal poses, the one near the prediction counts."""
 PENDING_M = 60.0
 """Travel after which a pending closure without enough support is dropped, metres."""
 
@@ -50,8 +48,7 @@ MINIMUM_SUPPORT = 3.0
 MINIMUM_SPREAD_M = MINIMUM_SUPPORT
 """Travel over which they are spread at least, a metre each: closures from one place are one piece of evidence."""
 MOST_NEARBY, NEARBY_M = 10, 2.0
-"""Most submaps in a square of the map, of this side in metres, that later ones are compared with; beyond, the oldest is
-forgotten."""
+"""Most submaps kept for comparison in a square of the map, of this side in metres; beyond, the oldest is forgotten."""
 SIGHT_M = 8.0
 """Largest distance between the anchors of two submaps that are compared, besides the drift allowance; farther ones
 overlap too little, metres."""
@@ -67,8 +64,7 @@ SIMILAR_PLACES = 6 * MOST_CANDIDATES
 WIDEST_M, WIDEST_RAD = 15.0, 0.7
 """Largest half side and half angle of the search window, metres and radians."""
 RECOGNIZED_DRIFT = 0.25
-"""Largest drift of the position, metres per metre of path through the graph, at which place recognition closes a loop
-out of the search's reach."""
+"""Largest drift, metres per metre of path through the graph, at which place recognition closes loops out of reach."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,8 +24,7 @@ CLEAR, LEAST_KNOWN = 0.8, 0.5
 part that an unclear match does not explain may be the only one that stands still."""
 NEAR = 2.0
 FAR = 2.0 * NEAR
-"""A match agrees with odometry up to the first distance and contradicts it from the second on, in standard deviations
-of odometry's learned error."""
+"""A match agrees with odometry up to the first and contradicts it from the second, in sigmas of its learned error."""
 LEAST_SIGMA_M, SIGMA_PER_TURN = 0.025, 0.1
 LEAST_SIGMA_RAD = LEAST_SIGMA_M / 2.5
 """Least standard deviations of odometry that a match is judged by, metres and radians, and their growth per radian of

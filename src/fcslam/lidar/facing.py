@@ -39,8 +39,7 @@ NOISE_M: Final = 0.1
 LARGEST_STEP_M: Final = 3.0 * NOISE_M
 """Beams side by side whose ranges differ by more see two things."""
 STEPS_DEG: Final = (30, 3)
-"""Between the mountings that are tried, first and around the best; a laser that is turned by nearly a multiple of a
-right angle is turned by it."""
+"""Between the mountings that are tried, first and around the best; nearly a multiple of a right angle counts as one."""
 ENOUGH_AGREEMENT: Final = 0.75
 """Agreement with which a mounting is right."""
 LEAST_AGREEMENT: Final = 0.6

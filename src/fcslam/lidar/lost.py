@@ -44,8 +44,7 @@ SETTLED_M = 3.0
 AGREEING = 0.90
 """Least median share of points that the doubtful scans explain of each other; below it, nothing is decided."""
 LOST_EXPLAINED = 0.60
-"""A lost robot sees a smaller share of its points in known area on a surface. Two scans show one place if the share is
-larger."""
+"""A lost robot sees a smaller share of its points in known area on a surface; two scans of one place, a larger one."""
 LOST_VIOLATION = 0.30
 """A lost robot sees a larger share of its points in known area in free space."""
 RODE = 0.73
@@ -62,8 +61,7 @@ GAP_TRAVEL_M = 2.0 * DOUBTFUL_TRAVEL_M
 """``DOUBTFUL_TRAVEL_M`` after a gap, metres: more walls fit in fewer ways."""
 LEAST_RATIO, LEAST_RIVAL_M, LARGEST_VIOLATION = 1.5, 5.0, 0.12
 """The best alignment after a gap scores higher than the best one elsewhere by this factor. The one elsewhere counts as
-so many metres at least: a few walls are never unique. No larger share of the walls of one lies in free space of the
-other."""
+so many metres at least: a few walls are never unique. At most this share of the walls lies in free space."""
 LARGEST_STEP_M = 15.0
 """A robot that moved farther than this, in metres, between two scans is lost: nobody saw the way."""
 
@@ -91,8 +89,7 @@ def is_doubtful(
 ) -> bool:
     """Whether a scan may show another place than the scans before it.
 
-    So may a scan without odometry that was not accepted, as nothing else says where the robot is, and all scans while
-    the robot leaves a closed cabin.
+    So may a scan without odometry that was not accepted, and all scans while the robot leaves a closed cabin.
     """
     if frontend.settled_m < SETTLED_M or not config.doubted:
         return False
@@ -114,8 +111,7 @@ def can_decide(scans: Sequence[LaserScan], travel_m: float = DOUBTFUL_TRAVEL_M, 
 def is_lost(scans: Sequence[LaserScan], frontend: LidarFrontend, closed_s: float | None = None) -> bool:
     """Whether consecutive scans that the front end has deferred show another place than its newest keyscans.
 
-    ``closed_s`` is the stamp at which the door of the cabin closed that the robot leaves, seconds; None: it leaves
-    none.
+    ``closed_s`` is the stamp at which the door of the cabin that the robot leaves closed, seconds; None: no cabin.
     """
     fresh = frontend.fresh()
     if not _are_consistent(scans, fresh):

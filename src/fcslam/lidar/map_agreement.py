@@ -39,8 +39,7 @@ SAME_M, OTHER_M = 0.004, 0.03
 of recorded logs and of drives in published floors."""
 MOVED, UNLIKE = 0.1, 0.4
 MOST_MOVED: Final = 3.0 * MOVED
-"""Shares of stretches whose offset is arbitrary: furniture that moved, at least and at most, and walls of another
-place."""
+"""Shares of stretches with an arbitrary offset: moved furniture, at least and at most, and walls of another place."""
 IN_FREE, IN_FREE_ELSEWHERE = 0.02, 0.11
 """Shares of stretches in free space, in the same place and in another, for maps that do not contradict themselves."""
 MOST_SELF_IN_FREE: Final = 0.15

@@ -21,8 +21,7 @@ NO_NORMAL_WEIGHT: Final = 0.5
 NEW_MOTION: Final = 1000
 """A surface is new until the robot has moved by this much since it was first seen, in mm, turns in mrad."""
 MOST_NEW: Final = 2.0
-"""Largest weight of all points on new surfaces, as a multiple of that of the points on older ones, where that leaves
-each the least weight."""
+"""Largest weight of all points on new surfaces per that of those on older ones, where each keeps the least weight."""
 LEAST_NEW_WEIGHT: Final = 0.3
 """Least weight of a point on a new surface, as where hardly anything else is seen and odometry may slip."""
 ALONG_LIMIT2: Final = 9.0
@@ -44,8 +43,7 @@ FAST_SHRINK: Final = 0.35
 MOST_ITERATIONS = 20
 """Largest number of Gauss-Newton steps."""
 NARROW_SCALE_M = 0.06
-"""Scale of the robust loss at the last step, and standard deviation of a point's distance to its surface in the
-likelihood of a scan, metres."""
+"""Scale of the robust loss at the last step, and standard deviation of a point's distance in the likelihood, metres."""
 POINT_SIGMA_M = 0.5 * NARROW_SCALE_M
 """Standard deviation of a point's distance, metres; wide, as errors of neighbours are correlated."""
 EXPLAINED_M = 0.10
@@ -137,7 +135,7 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter, tail):  # t
     + log(1 + p_theta v_theta^2), with d^2 = (pose - guess)^T prior (pose - guess), for position and heading apart if
     the tail is finite, and with p the ``velocity_prior``: a robot that drives straight may begin to turn within a
     scan, so the prior of the turn rate has the tails of Cauchy's distribution. The Jacobian of e_i over pose and
-    velocity v is (J_i, t_i J_i). So the normal equations consist of the sums of J^T J, t J^T J and t^2 J^T J. The Schur
+    velocity v is (J_i, t_i J_i). So the normal equations have sums of J^T J, t J^T J and t^2 J^T J. The Schur
     complement eliminates v.
     """
     pose, velocity = guess.copy(), np.zeros(3)

@@ -17,8 +17,7 @@ from fcslam.records import FloatArray
 TAIL: float = 1.0
 """Degrees of freedom of the Student t distribution of the error; few, as wheels may slip."""
 PRIOR_TAIL: float = 3.0
-"""The same in the prior of a match once the error is learned. Gauss-Newton starts at odometry: with fewer it would stay
-there."""
+"""The same in the prior of a match once the error is learned. Gauss-Newton would stay at odometry with fewer."""
 FIRST_MATCHES = 20
 LATEST_MATCHES = 10 * FIRST_MATCHES
 """The model counts as many matches as the first number; later matches replace the oldest of the second number."""

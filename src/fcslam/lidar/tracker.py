@@ -35,8 +35,7 @@ UNSURE_M = 0.05
 """Learned standard deviation of odometry, in metres, beyond which a match has several starts. After a long step a match
 may end at a maximum of the likelihood that is nearer to odometry than the right one."""
 CLUTTER_SCALE_M = 0.5 * WIDE_SCALE_M
-"""Least scale of the loss of points without a normal after such a step, metres: of a hedge, the robot then sees other
-points than before."""
+"""Least scale of the loss of points without a normal after such a step, metres: a hedge then shows other points."""
 UNSURE_SUPPORTED = 0.2
 """``SUPPORTED`` after such a step: odometry alone errs by more than a match of which less is known."""
 NO_INFORMATION = np.zeros((3, 3))

@@ -155,7 +155,7 @@ def judge(
     symmetric = asymmetric is None
     if asymmetric is not None:
         noise = no_noise  # it takes two submaps, and decides nothing
-    least = _least_eigenvalue(worse)
+    least = max(INFORMATIVE, INFORMATIVE_SHARE * worse.count)
     informative = weakest >= least
     one_direction = Reason(ReasonCode.ONE_DIRECTION, weakest, least)
     not_strict = _shortfall(worse, STRICT, no_noise if predicted else noise)
@@ -176,10 +176,6 @@ def judge(
 def _sample(surface: PointScan) -> PointScan:
     """About ``ALIGNED_POINTS`` points: more add little. Copied, so that compiled code sees one memory layout."""
     return surface.only(np.arange(0, len(surface), max(1, len(surface) // ALIGNED_POINTS)))
-
-
-def _least_eigenvalue(found: Agreement) -> float:
-    return max(INFORMATIVE, INFORMATIVE_SHARE * found.count)
 
 
 def _asymmetry(gap: FloatArray) -> Reason | None:

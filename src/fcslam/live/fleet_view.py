@@ -1,5 +1,4 @@
-"""What a live robot knows of its fleet: the joint map and how good it is, where the others are,
-and where to explore.
+"""What a live robot knows of its fleet: the joint map and its quality, where the others are, and where to explore.
 
 A thread follows the cloud. No scan waits for it, and while the cloud is away everything stays as it was last.
 """

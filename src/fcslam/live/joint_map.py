@@ -49,8 +49,7 @@ class JointMap:
     def __init__(self, fleet: FleetView, config: OccupancyConfig) -> None:
         self._fleet, self._config = fleet, config
         self._drawn: deque[tuple[int, Keyscan, LaserModel]] = deque(maxlen=MOST_DRAWN)
-        """Session and laser of keyscans that the joint map of the cloud may not show yet, without returns from other
-        robots."""
+        """Session and laser of keyscans that the joint map may not show yet, without returns from other robots."""
         self._lasers: tuple[LaserModel, ...] = ()
         """As the robot announced them last."""
         self._newest: tuple[int, FloatArray] | None = None

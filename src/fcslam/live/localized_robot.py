@@ -83,8 +83,7 @@ class LocalizedRobot(LiveTracker):
             wiring: for fcslam's own commands and tests.
 
         Raises:
-            InputError: the name, a laser, the configuration, the map or the pose cannot be used, or the worker does not
-                start.
+            InputError: the name, a laser, the configuration, map or pose cannot be used, or the worker does not start.
         """
         super().__init__(name, laser, settings_of(config), on_event)
         self._map = map if isinstance(map, OccupancyMap) else read_map(Path(map), floor)

@@ -242,8 +242,7 @@ class Wiring(NamedTuple):
     resumes: bool = False
     """Whether the robot read the recording before and was interrupted; its packets come again."""
     keeps_keyframes: bool = False
-    """Whether the keyframes of the camera stay in the state folder, for a process that learns from them; the next start
-    removes them."""
+    """Whether the camera's keyframes stay in the state folder until the next start, for a process that learns."""
     transport: HttpTransport | None = None
     """Connection to a cloud of a test. None: that to the robot's server, if it has one."""
 

@@ -233,8 +233,7 @@ class Robot(LiveTracker):
         )
 
     def map(self) -> OccupancyMap:
-        """The map that the robot is in: with a server the joint map of its fleet, with what the robot saw lately drawn
-        into it.
+        """The map that the robot is in: with a server its fleet's joint map, with what the robot saw lately drawn in.
 
         Without a server, and before it has drawn the map that the robot is in, it is ``own_map``. While the server is
         away, it is the newest joint map with all that the robot has seen since.
@@ -287,8 +286,7 @@ class Robot(LiveTracker):
     def trajectory(self) -> RobotTrajectory:
         """All scans since the robot was last lost or changed its floor; it waits for the worker.
 
-        With a map of its own, the poses are corrected by all loop closures so far. Without, all move with the server's
-        newest correction.
+        All loop closures so far correct the poses; without a map of its own, the server's newest correction moves them.
         """
         self._catch_up()
         with self._lock:
@@ -320,8 +318,7 @@ class Robot(LiveTracker):
         )
 
     def finish(self, timeout_s: float | None = None, watch: Callable[[RobotStatus], None] | None = None) -> bool:
-        """End the recording: close the last loops, and wait until the server has everything. Nothing can be added
-        after it.
+        """End the recording: close the last loops and wait until the server has everything. Then nothing can be added.
 
         Args:
             timeout_s: longest time to wait for the server, seconds; None: as long as it takes.
@@ -364,9 +361,7 @@ class Robot(LiveTracker):
             self._take(self._frontend.ready())
 
     def wait_for_room(self, watch: Callable[[RobotStatus], None] | None = None) -> None:
-        """Wait until the back end, the map, the disk and the server have caught up enough to take more, for a program
-        that adds records faster than a robot.
-        """
+        """Wait until back end, map, disk and server can take more: for programs that add records faster than robots."""
         self._raise_failure()
         while self._is_behind() and not self._is_closed:
             self._wait_once(watch)

@@ -86,7 +86,8 @@ def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closure
     colors = {robot: _bgr(color) for robot, color in palette.robot_colors(trajectories).items()}
     ways = [(view.pixels(points), colors[robot]) for robot, points in trajectories.items()]
     for pixels, color in ways:
-        _draw_trajectory(canvas, pixels, color)
+        _draw_line(canvas, pixels, FLOOR, 5)  # a light outline, for contrast with walls and other lines
+        _draw_line(canvas, pixels, color, 2)
     for ends in _spread(closures):
         _draw_line(canvas, view.pixels(ends), CLOSURE, 1)
     for pixels, color in ways:
@@ -206,12 +207,6 @@ def _canvas(view: _Viewport) -> Image:
     )
     margins = MARGIN_PX, MARGIN_PX, view.offset_px, view.offset_px
     return np.asarray(cv2.copyMakeBorder(drawn, *margins, cv2.BORDER_CONSTANT, value=PAPER))
-
-
-def _draw_trajectory(canvas: Image, pixels: FloatArray, color: Color) -> None:
-    """Draw a coloured line with a light outline, so that it contrasts with walls and other lines."""
-    _draw_line(canvas, pixels, FLOOR, 5)
-    _draw_line(canvas, pixels, color, 2)
 
 
 def _draw_start(canvas: Image, pixels: FloatArray, color: Color) -> None:

@@ -20,8 +20,7 @@ VIEW_M: Final = 5.0
 GAIN_M_PER_M2: Final = 0.5
 """Metres of path that one square metre of unknown area is worth."""
 SAME_M: Final = 1.0
-"""Frontiers this near to each other in two moments are the same one. A robot that stands farther from a passable cell
-reaches nothing."""
+"""Frontiers this near in two moments are the same one. A robot farther from a passable cell reaches nothing."""
 POCKET_M2: Final = SAME_M**2
 """Smaller areas are no place for a robot."""
 KEEPING_M: Final = 3.0 * SAME_M
@@ -105,8 +104,7 @@ class Explorer:
     def assign(self, found: Sequence[Frontier], robots: Mapping[str, tuple[float, float]]) -> dict[str, Frontier]:
         """The frontier of each robot that can reach one.
 
-        The frontiers of the present map have a distance for each of the robots, in their order;
-        positions in metres, in the frame of the map.
+        The frontiers of the present map have a distance for each robot, in order; positions in metres, in its frame.
         """
         from scipy.optimize import linear_sum_assignment  # it takes long to load, and a certificate does not need it
 

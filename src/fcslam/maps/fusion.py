@@ -49,8 +49,7 @@ def fuse(
     """Compute the occupancy map of keyscans; their order does not matter, their stamps do.
 
     ``T_map_base`` (N, 3) are the poses of the keyscans in ``map``, in metres and radians; ``lasers`` those that each
-    robot announced. ``senders`` names the robot of each session, if points on other robots are not drawn; None: all
-    are.
+    robot announced. ``senders`` names each session's robot, to leave out points on other robots; None: all are drawn.
     """
     *_, newest = fuse_periods(keyscans, T_map_base, lasers, config, periods_of(keyscans), senders)
     return newest

@@ -32,8 +32,7 @@ class TileBatch(NamedTuple):
     """An answer to a robot."""
 
     frame: str
-    """Identifies the history of tiles, which has one coordinate frame and resolution. In another frame, earlier tiles
-    count no longer."""
+    """Identifies the history of tiles, with one coordinate frame and resolution; in another, earlier tiles are void."""
     version: int
     """Version of the newest change that the robot has with these tiles."""
     resolution_m: float

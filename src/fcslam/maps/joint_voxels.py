@@ -38,17 +38,11 @@ end_header
 """
 
 
-def joint_points(maps: Sequence[tuple[VoxelMap, FloatArray]]) -> tuple[FloatArray, FloatArray]:
-    """Points (N, 3) and normals (N, 3) of voxel maps, given with ``T_map_base`` (7,) of their keyscans.
-
-    Normals face the scanner.
-    """
-    middles, scanner = joint_voxels(maps)
-    return middles, _normals(middles, scanner)
-
-
 def joint_voxels(maps: Sequence[tuple[VoxelMap, FloatArray]]) -> tuple[FloatArray, FloatArray]:
-    """The middle of the points of each voxel (N, 3), and where a scanner saw it from (N, 3); maps as before."""
+    """The middle of the points of each voxel (N, 3), and where a scanner saw it from (N, 3).
+
+    The voxel maps are given with ``T_map_base`` (7,) of their keyscans.
+    """
     T_map_ground = [se3.compose(pose, voxels.T_base_ground) for voxels, pose in maps]
     placed = list(zip(T_map_ground, (voxels for voxels, _ in maps), strict=True))
     points = np.concatenate([se3.transform(T, voxels.points_m) for T, voxels in placed])
@@ -79,11 +73,11 @@ def _normals(points: FloatArray, scanner: FloatArray) -> FloatArray:
 
 def ply_of(maps: Sequence[tuple[VoxelMap, FloatArray]]) -> bytes:
     """The joint map as a PLY file, binary and little endian, coloured by height."""
-    points, normals = joint_points(maps)
+    points, scanner = joint_voxels(maps)
     rows = np.zeros(len(points), _TYPE)
     for column, values in zip("xyz", points.T, strict=True):
         rows[column] = _rounded(values, 1024)
-    for column, values in zip(_NORMAL, normals.T, strict=True):
+    for column, values in zip(_NORMAL, _normals(points, scanner).T, strict=True):
         rows[column] = _rounded(values, 128)
     for column, channel in zip("rgb", _colours(points[:, 2]).T, strict=True):
         rows[column] = channel

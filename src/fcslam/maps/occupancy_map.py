@@ -129,8 +129,7 @@ def parse_map(name: str, pgm: bytes, description: str) -> OccupancyMap:
 def area_of(name: str, header: bytes, description: str) -> tuple[float, tuple[float, float, float, float]]:
     """Read the side of a cell, and the lowest x and y and highest x and y of a map, metres.
 
-    From the first ``HEADER_BYTES`` of its image and the content of the YAML file. ``name`` and errors as for
-    ``parse_map``.
+    From the first ``HEADER_BYTES`` of its image and its YAML file. ``name`` and errors as for ``parse_map``.
     """
     try:
         width, height, _ = _size(header)
@@ -159,9 +158,7 @@ def _own_description(description: str) -> tuple[float, tuple[float, float], floa
 
 
 def read_description(description: str) -> tuple[dict[str, Any], float, tuple[float, float, float], float, float]:
-    """Content, resolution (m), origin (x, y in m, theta in rad) and thresholds of occupied and of free cells in the
-    YAML file of a map, of whatever program.
-    """
+    """Content, resolution (m), origin (m, m, rad) and thresholds of occupied and free cells in a map's YAML file."""
     content: Any = parse_yaml(description)
     if not isinstance(content, dict):
         raise ValueError("the description is not a YAML mapping")

@@ -20,8 +20,7 @@ CLOSURES: Final = {Channel.LIDAR: 0xC2185B, Channel.CAMERA: 0x3D1E8F}
 def robot_colors(sessions: Iterable[str]) -> dict[str, int]:
     """The colour of each session. All sessions of a robot have one, which is the same in every run of its fleet.
 
-    A name chooses its colour: ``robot_2`` and ``ben`` the second one. If an earlier name has it, the next free one
-    follows.
+    A name chooses its colour, ``robot_2`` and ``ben`` the second one, or the next one that no earlier name has.
     """
     robots: dict[str, int] = {}
     for robot in sorted({_robot(session) for session in sessions}):

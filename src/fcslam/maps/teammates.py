@@ -1,7 +1,6 @@
 """Points of a scan that lie on another robot of the fleet: they are no part of the building.
 
-A robot with a false pose must not hide a wall. So a point counts as a robot's only where the scans of the other robots
-look through.
+A robot with a false pose must not hide a wall. So its points count only where other robots' scans look through.
 """
 
 from collections.abc import Mapping, Sequence

@@ -465,10 +465,7 @@ class MissionStore:
 def check_mission(path: Path) -> None:
     """Refuse a file that is not an exported mission."""
     check_file(path, SCHEMA, VERSION)
-    with (
-        translate_errors(path),
-        closing(open_database(path)) as opened,
-    ):
+    with translate_errors(path), closing(open_database(path)) as opened:
         labels = opened.execute("SELECT DISTINCT kind, channel, refusal IS NULL FROM packets").fetchall()
         facts = dict(opened.execute("SELECT name, value FROM facts").fetchall())
         edits = opened.execute("SELECT number, author, time, kind, content FROM edits ORDER BY number").fetchall()

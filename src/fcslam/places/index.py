@@ -30,10 +30,7 @@ class QueryResult(Generic[PlaceId]):
     """Similarities of the stored places to one query. Valid until the index changes."""
 
     def __init__(
-        self,
-        ids: Sequence[PlaceId] = (),
-        rows: NDArray[np.int32] = _NO_ROWS,
-        scores: FloatArray = _NO_SCORES,
+        self, ids: Sequence[PlaceId] = (), rows: NDArray[np.int32] = _NO_ROWS, scores: FloatArray = _NO_SCORES
     ) -> None:
         """Wrap the scores of a query.
 
@@ -55,8 +52,7 @@ class QueryResult(Generic[PlaceId]):
     def best(self, top_k: int, wanted: Callable[[PlaceId], bool] = lambda _: True) -> list[tuple[PlaceId, float]]:
         """Return up to ``top_k`` places for which ``wanted`` holds, and their similarities in [0, 1].
 
-        The most similar comes first; ties are broken by the order of storage. A place that has nothing in common with
-        the query is never returned.
+        The most similar comes first, of equal ones that stored first. Places without anything in common are left out.
         """
         found: list[tuple[PlaceId, float]] = []
         looked_at, count = 0, 2 * top_k + 16
@@ -130,8 +126,9 @@ class PlaceIndex(Generic[PlaceId]):
         self._ids.append(place)
         i = self._places_seen
         self._places_seen += 1
-        if self._is_due(i):
-            self._train_on_newest()
+        if self._is_due(i):  # lines 5-9, whose two cases are one window here: D_max(0, i - C + 1) ... D_i
+            rows = self._rows()[-self._config.capacity :]
+            self._train(self.postings.gather(rows), len(rows))
         elif self._trained_on is not None and self._config.strategy is Strategy.INCREMENTAL:
             self._split(self._overfull(leaves))
 
@@ -204,8 +201,7 @@ class PlaceIndex(Generic[PlaceId]):
     ) -> Self:
         """Restore an index from its ``state``; it behaves exactly like the original.
 
-        ``ids`` are those of the stored places, in the order in which they were added; the descriptors of each have
-        shape (N, 32).
+        ``ids``: of the stored places, in the order in which they were added; ``descriptors``: of each, shape (N, 32).
         """
         index = cls(config, np.random.default_rng(0))
         index._trained_on = state["trained_on"]
@@ -230,11 +226,6 @@ class PlaceIndex(Generic[PlaceId]):
                 return (i + 1) % (first + 1) == 0
             case Strategy.INCREMENTAL:
                 return i >= first and self._trained_on is None
-
-    def _train_on_newest(self) -> None:
-        """Algorithm 1, lines 5-9. Its two cases are one window here: D_max(0, i - C + 1) ... D_i."""
-        rows = self._rows()[-self._config.capacity :]
-        self._train(self.postings.gather(rows), len(rows))
 
     def _train(self, codes: CodeWords, places: int) -> None:
         """Algorithm 1, line 11: train V_t and describe all stored places in its words."""

@@ -163,8 +163,7 @@ def grow_tree(codes: CodeWords, shape: TreeShape, seed: np.uint64) -> Tree:
 def k_means(codes: CodeWords, shape: TreeShape, state: NDArray[np.uint64]) -> tuple[CodeWords, NDArray[np.int64]]:
     """Cluster codes (N, 4) by Hamming distance: centres (C, 4), none without members, and the cluster of each, (N,).
 
-    There are ``shape.branching`` clusters at most, after ``shape.iterations`` rounds at most. The ``state`` (1,) of the
-    random generator is advanced.
+    At most ``shape.branching`` clusters, after at most ``shape.iterations`` rounds. Advances the random ``state`` (1,).
     """
     centres = _seed_centres(codes, shape.branching, state)
     labels = np.full(codes.shape[0], -1, np.int64)

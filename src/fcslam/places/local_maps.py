@@ -14,8 +14,7 @@ from fcslam.lidar.submap import Located, Submap, build_submap
 from fcslam.records import FloatArray
 
 REACH_M = 45.0
-"""Keyscans up to this far from the middle of the matching places make a map: of both wings of a building that repeats
-itself."""
+"""Keyscans up to this far from the middle of the matching places make a map: of both wings of a repetitive building."""
 MOST_KEYSCANS = 150
 """Most keyscans of such a map; of more, evenly spaced ones."""
 

@@ -49,8 +49,7 @@ class MatchDecision(StrEnum):
 
 
 ALIGNED_CANDIDATES = 2
-"""Most similar places of other robots in the same map that are compared although the map puts them elsewhere, to find
-evidence against the join."""
+"""Most similar places in the same map compared although it puts them elsewhere, for evidence against the join."""
 
 
 class MatcherConfig(Settings):
@@ -220,14 +219,14 @@ class PlaceMatcher:
             matches = self._verified(self._comparisons(place, result, predicted, is_unaligned), place, result)
         self._places[place.id] = place
         self._backlog.append(place)
-        self._forget_oldest()
+        while len(self._places) > self._config.most_places:  # bounds the memory of long missions
+            self.forget(next(iter(self._places)))
         return matches
 
     def match_at(self, place: Place, expected: Mapping[KeyscanId, FloatArray]) -> list[PlaceMatch]:
         """The stored places that a new place overlaps about where known starts of their robots put it.
 
-        ``place`` is j, which is not stored here; ``expected`` has T_i_j (3,) of the stored places i; forgotten places
-        are ignored.
+        ``place`` is j, not stored here; ``expected`` has T_i_j (3,) of the stored places i; forgotten ones are ignored.
         """
         kept = [(i, T_i_j) for i, T_i_j in expected.items() if i in self._places]
         pairs = [self._pair(i, place, Motion(T_i_j, NO_PRIOR, 0.0), predicted=True) for i, T_i_j in kept]
@@ -332,11 +331,6 @@ class PlaceMatcher:
             self._backlog = [stored for stored in self._backlog if stored.id != place]
         self._on_forget(gone)
 
-    def _forget_oldest(self) -> None:
-        """Bound the memory of long missions: keep the newest places."""
-        while len(self._places) > self._config.most_places:
-            self.forget(next(iter(self._places)))
-
     def _candidates(self, result: QueryResult[KeyscanId], is_unaligned: Callable[[KeyscanId], bool]) -> list[KeyscanId]:
         """All places of unaligned robots while they are few, else the most similar ones."""
         eligible = [i for i in self._places if is_unaligned(i)]
@@ -398,8 +392,7 @@ class PlaceMatcher:
     def _plausible(self, comparisons: Sequence[_Comparison], place: Place) -> list[_Comparison]:
         """The comparisons without the proposed motions that contradict the free space most.
 
-        Where many robots meet, most proposals are false. One count of points in free space takes a twentieth of the
-        time of an alignment.
+        Where many robots meet, most are false. To count points in free space takes a twentieth of an alignment's time.
         """
         doubted = [(n, guesses) for n, (_, guesses, predicted) in enumerate(comparisons) if not predicted]
         proposed = [(n, guess) for n, guesses in doubted for guess in guesses]

@@ -191,8 +191,7 @@ class Postings:
 def grown_rows(array: NDArray[Scalar], length: int) -> NDArray[Scalar]:
     """Grow ``array`` (N, ...) to shape (length, ...); the caller must not use the old array or a view of it.
 
-    Large arrays grow in place: the system remaps their pages (mremap) instead of copying them, so that no new place
-    waits for a copy of gigabytes.
+    Large arrays grow in place: the system remaps their pages (mremap), so no new place waits for a copy of gigabytes.
     """
     if not (array.flags.owndata and array.flags.writeable):
         array = array.copy()

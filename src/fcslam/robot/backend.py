@@ -123,8 +123,7 @@ class RobotBackend:
     def __init__(self, robot: str, config: SessionConfig, keyframes: Path | None = None) -> None:
         """Load the detector of camera images.
 
-        ``keyframes`` is the folder that keeps the keyframes, for a process that learns from them; None: they are not
-        kept.
+        ``keyframes`` is the folder that keeps the keyframes, for a process that learns; None: they are not kept.
         """
         self._robot = robot
         self._config = config

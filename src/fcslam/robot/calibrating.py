@@ -48,16 +48,14 @@ LEAST_DELAY_S: Final = 0.02
 LEAST_YAW_RAD: Final = 0.005
 LEAST_OFFSET_M: Final = 0.02
 LARGEST_OFFSET_M: Final = 1.0
-"""A laser is not farther from where tf says. A drive along one circle fixes neither mounting nor times; then nothing is
-corrected."""
+"""A laser is not farther from where tf says: one circle fixes neither mounting nor times; then nothing is corrected."""
 LEAST_SCALE: Final = 0.01
 GROSS_SCALE: Final = 0.25
 """Scales that differ by more are no matter of precision."""
 LEAST_SHARE: Final = 0.25
 """Smaller differences from what the bag says are not corrected: matching holds back short turns by up to 20 %."""
 AT_ONCE_SHARE: Final = 0.2
-"""Beams that take a smaller share of the time between scans are measured at once. If they are only said to take so
-little, they may take longer."""
+"""Beams that take a smaller share of the time between scans are measured at once, unless they are only said to."""
 WHOLE_SHARE: Final = 0.05
 """A scanner that spins without a pause measures all the time between scans."""
 FLOOR_HALF_DEG: Final = 75

@@ -85,8 +85,7 @@ class RobotFrontend:
     ) -> None:
         """Start the first session.
 
-        ``backend`` runs the back end beside this front end; None: it runs inline. ``mark`` marks the beams of a scan
-        that hit other robots, before it is matched.
+        ``backend`` runs the back end beside this; None: inline. ``mark`` marks beams on other robots before a match.
         """
         self.robot = robot
         self.tracks: list[ScanTrack] = []
@@ -171,8 +170,7 @@ class RobotFrontend:
         return self.packets.ready(wait)
 
     def set_detector(self, file: DetectorFile, path: Path) -> "Future[list[Body]]":
-        """Use another network for camera images from now on, as the cloud announced it; it describes buffered images
-        again.
+        """Use a network that the cloud announced for camera images from now on; it describes buffered images again.
 
         Done when the back end uses it, or refuses it with the ``FeatureError`` of ``RobotBackend.process``.
         """

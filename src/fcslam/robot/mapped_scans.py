@@ -18,8 +18,7 @@ from fcslam.wire.quantisation import rounded
 class MappedScans:
     """Prepares the scans of one robot for its map.
 
-    Of a dense scan, every k-th beam is mapped. The first scan of a laser decides k, so that a scanner whose beams vary
-    remains one laser.
+    Of a dense scan, every k-th beam is mapped; a laser's first scan decides k, as its beams may vary.
     """
 
     def __init__(self, ignore: Sectors = (), footprint: Polygon = ()) -> None:

@@ -16,17 +16,11 @@ from fcslam.lidar.tracker import TrackedScan, TrackingResult
 from fcslam.records import CameraImage, FloatArray, LaserScan, Sweep, frozen
 
 LEAST_SHARE, LARGEST_SHARE = 0.5, 3.0
-"""Limits of the next motion as a share of the last one: intervals vary if scans are dropped, but also if stamps are
-wrong."""
+"""Limits of the next motion as a share of the last one: intervals vary by dropped scans, but also by wrong stamps."""
 PREDICTED = OdometryModel(
-    is_measured=False,
-    position_m=0.1,
-    position_per_travel=0.5,
-    heading_rad=0.1,
-    heading_per_turn=0.5,
+    is_measured=False, position_m=0.1, position_per_travel=0.5, heading_rad=0.1, heading_per_turn=0.5
 )
-"""Model of a robot without odometry: every scan is matched, and the prediction is trusted little. Within a tenth of a
-second, a robot may brake or turn by so much."""
+"""Model without odometry: every scan is matched; a robot may brake or turn by so much within a tenth of a second."""
 InOdom = Callable[[TrackedScan], FloatArray]
 """Gives ``T_odom_base`` of a localized scan, shape (3,), in a frame without jumps."""
 Deferred = list[LaserScan | CameraImage]
@@ -36,8 +30,7 @@ Deferred = list[LaserScan | CameraImage]
 class MotionPrediction:
     """Stands in for the odometry of a robot, with constant velocity.
 
-    It is the velocity in the sweep of the last scan, or that between the last two scans if they were measured at once.
-    If there is a gyro, it measures the turns.
+    It is that in the sweep of the last scan, or between the last two if measured at once. A gyro measures the turns.
     """
 
     def __init__(self) -> None:
@@ -125,8 +118,7 @@ class MotionPrediction:
     def observe(self, stamp: float, T_smooth_base: FloatArray | None, sweep: Sweep | None) -> None:
         """Where the tracker found the scan: its pose in a frame without jumps, shape (3,), and its matched sweep.
 
-        None: it was not matched; then the robot is assumed to stand still, as a wrong velocity would take it ever
-        further.
+        None: it was not matched; the robot is then assumed to stand still, as a wrong velocity would lead ever further.
         """
         elapsed_s = math.inf if self._last is None else stamp - self._last[0]
         self.is_new, self._elapsed_s, self._sweep = False, 0.0, None

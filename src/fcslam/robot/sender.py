@@ -185,10 +185,7 @@ class Sender:
         announced = [packet.body.file for packet in packets if isinstance(packet.body, DetectorUpdate)]
         for file in announced:
             if file not in self._announced:
-                self._fetch(file)
+                with suppress(CloudError):
+                    self._keep(file, self._transport.detector(file.channel, file.version))
                 self._announced.append(file)
         self._announced = announced or self._announced
-
-    def _fetch(self, file: DetectorFile) -> None:
-        with suppress(CloudError):
-            self._keep(file, self._transport.detector(file.channel, file.version))

@@ -1,7 +1,6 @@
 """The clock of a robot on a ROS network, and the stamps of ``map -> odom`` by it.
 
-The clock is the computer's, or that of a simulator or of a bag that is played. Between two scans the transform is
-published again, for later times.
+The clock is the computer's, a simulator's or that of a played bag. Between scans the transform is published again.
 """
 
 import threading

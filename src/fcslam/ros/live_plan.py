@@ -98,11 +98,7 @@ class FirstMessages(Messages):
     def state(self) -> tuple[object, ...]:
         """What decides whether there is a plan; another one may come with another state."""
         return tuple(
-            (
-                min(self.counts[topic], FEWEST_FLOORS),
-                its.count > its.unstamped,
-                sum(map(len, its.links.values())),
-            )
+            (min(self.counts[topic], FEWEST_FLOORS), its.count > its.unstamped, sum(map(len, its.links.values())))
             for topic, its in self._census.items()
         )
 

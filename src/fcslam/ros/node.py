@@ -80,8 +80,7 @@ class RobotNode:
     ) -> None:
         """Begin to receive and to publish.
 
-        ``suggest_pose`` takes initial poses, if the robot is one in a finished map. ``change_floor`` takes floors, if
-        it maps.
+        ``suggest_pose`` takes initial poses, if the robot is in a finished map; ``change_floor`` floors, if it maps.
         """
         self._network, self._namespace, self._topics = network, namespace, topics
         self._map_topic = resolved(namespace, MAP)

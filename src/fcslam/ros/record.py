@@ -23,16 +23,11 @@ LARGEST_WAITING_BYTES = 256_000_000
 
 
 def record(
-    network: RosNetwork,
-    topics: SensorTopics,
-    output: Path,
-    stop: threading.Event,
-    notify: Notify,
+    network: RosNetwork, topics: SensorTopics, output: Path, stop: threading.Event, notify: Notify
 ) -> Counter[str]:
     """Write all messages of the sensors, and /clock, until ``stop``; returns their number by topic.
 
-    The file moves to ``output`` at the end. If it cannot be written to the end, what the disk took is kept beside it,
-    but for the last megabyte.
+    The file moves to ``output`` at the end; if it cannot, what the disk took is kept beside it but the last megabyte.
     """
     from rosbags import rosbag2
 

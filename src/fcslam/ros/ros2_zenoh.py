@@ -192,9 +192,7 @@ def session_config(environment: Mapping[str, str]) -> Any:
 
 
 def attachment(number: int, time_ns: int, sender: bytes) -> bytes:
-    """Return the attachment that rmw_zenoh adds to a message: its number, its time and the 16 bytes of its sender, with
-    their length.
-    """
+    """The attachment of rmw_zenoh to a message: its number, its time, and the sender's 16 bytes with their length."""
     return struct.pack("<qqB16s", number, time_ns, len(sender), sender)
 
 

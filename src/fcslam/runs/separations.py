@@ -17,11 +17,7 @@ _GATES = (
     ReasonCode.LITTLE_OVERLAP,
 )
 """Tests of verification in their order: a candidate that fails a later one came closer."""
-_FINAL = (
-    ReasonCode.MAPS_CONTRADICT,
-    ReasonCode.FALSE_BRIDGE,
-    ReasonCode.VETOED,
-)
+_FINAL = (ReasonCode.MAPS_CONTRADICT, ReasonCode.FALSE_BRIDGE, ReasonCode.VETOED)
 """More drives do not help against these."""
 _JOINS_NONE = "\n  join_maps: false\n"
 """Line of the configuration ``fleet.join_maps``, as ``fcslam.config.dump`` writes it."""

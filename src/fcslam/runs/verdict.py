@@ -101,12 +101,7 @@ def _verdict(run: RunTables, k: int, certificate: Mapping[str, Any] | None, apar
     members = [trajectory for trajectory in run.trajectories.values() if trajectory.map_index == k]
     names = {trajectory.robot for trajectory in members}
     joins = sorted((j for j in run.joins if {j.robot_i, j.robot_j} <= names), key=lambda join: join.places)
-    concerns = [
-        *_of_paths(members),
-        *_of_joins(run, joins),
-        *_of_accuracy(certificate),
-        *_of_separations(k, apart),
-    ]
+    concerns = [*_of_paths(members), *_of_joins(run, joins), *_of_accuracy(certificate), *_of_separations(k, apart)]
     grave = list(Use)
     concerns.sort(key=lambda concern: -grave.index(concern.use))  # stable
     use = concerns[0].use if concerns else Use.USE

@@ -122,8 +122,7 @@ def read_joint_maps(path: Path) -> JointMaps:
 
 
 Exploration = tuple[tuple[str, ...], Sequence[Frontier], Mapping[str, Frontier]]
-"""The robots whose distances the frontiers of one map have; the frontiers; and the one that each robot explores, which
-lacks robots that can reach none."""
+"""The robots whose distances the frontiers of one map have; the frontiers; and each robot's, if it can reach one."""
 
 
 class ServedJointMaps:
@@ -169,8 +168,7 @@ class ServedJointMaps:
     def pose(self, session: JointSession) -> tuple[tuple[float, float, float], float]:
         """The newest credible pose of a robot and when it was there, seconds since 1970.
 
-        What a robot says of itself counts only if it can have driven there since its newest keyscan, which the map
-        confirms.
+        What a robot says counts only if it can have driven there since its newest keyscan, which the map confirms.
         """
         number, pose, said_s = self._live.get(session.robot, (-1, session.pose, 0.0))
         if number == session.map and 0.0 < session.heard_s <= said_s:

@@ -595,10 +595,7 @@ def main() -> int:
     look_s = math.inf if task.store is None else 0.25  # nobody notifies of packets that other instances stored
     alone = _alone(folder)
     try:
-        with (
-            verifying(task.workers, must_connect=False) as verify_pairs,
-            _mission(folder, task) as (store, share),
-        ):
+        with verifying(task.workers, must_connect=False) as verify_pairs, _mission(folder, task) as (store, share):
             worker = Worker(folder, store, time.monotonic, emit_event, start_copy, verify_pairs, share)
             emit_event(READY, None)
             while True:

@@ -64,8 +64,7 @@ def read_state(path: Path, fits: str) -> State | None:
 
 @cache
 def code_version() -> str:
-    """Hash of the program and of the libraries that it computes with: others may decide otherwise, so a state fits no
-    other one."""
+    """Hash of the program and the libraries that it computes with: others may decide otherwise with the same state."""
     hashed = hashlib.blake2b(" ".join(map(version, _LIBRARIES)).encode(), digest_size=16)
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         hashed.update(path.read_bytes())

@@ -31,8 +31,7 @@ TRUE_MAP = Path("ground_truth", "map.yaml")
 
 
 KnownPoses = tuple[PoseTable, PoseTable]
-"""Estimated poses of a run at the stamps at which the truth is known; and the true ones, row by row, in the frame of
-the truth, which counts as one map."""
+"""Estimated poses of a run where the truth is known; and the true ones, row by row, in its frame, which is one map."""
 
 
 def truth_folder(run: Path, named: Path | None) -> Path:

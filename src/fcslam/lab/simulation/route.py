@@ -63,7 +63,7 @@ def plan_route(plan: FloorPlan, goals: FloatArray, length_m: float, rng: np.rand
         there = space.nearest(goal + rng.uniform(-_SWAY_M, _SWAY_M, 2))
         leg = _swayed(space.path(here, there), space, rng)
         waypoints.extend(leg[1:])
-        driven_m += _length(leg)
+        driven_m += float(np.sum(np.linalg.norm(np.diff(leg, axis=0), axis=1)))
         here = there
         if driven_m >= length_m:
             break
@@ -141,10 +141,6 @@ def _swayed(leg: FloatArray, space: DrivableSpace, rng: np.random.Generator) -> 
         if np.all(np.isfinite(space.leg_costs(corner, np.array([swayed[k - 1], leg[k + 1]])))):
             swayed[k] = corner
     return swayed
-
-
-def _length(waypoints: FloatArray) -> float:
-    return float(np.sum(np.linalg.norm(np.diff(waypoints, axis=0), axis=1)))
 
 
 def _cut(waypoints: FloatArray, length_m: float) -> FloatArray:

@@ -53,8 +53,7 @@ class RoundRules:
     collapse: float = 0.15
     """Drop of the score below the best version at which training returns to that version."""
     fewest_pairs: int | None = None
-    """Held-out pairs of the robots by which a release is decided, of clients that train on points that they saw again;
-    None if versions are evaluated on images."""
+    """Held-out pairs that decide a release, of clients that train on points seen again; None: evaluated on images."""
 
 
 RULES: Final = RoundRules()

@@ -61,8 +61,7 @@ def run(data: Path, output: Path, settings: FleetLearningSettings, listener: soc
 
 
 def _start(data: Path, output: Path) -> Path:
-    """The detector from which training starts: a copy of the one that the service announced at the first start, or of
-    the bundled one."""
+    """The detector from which training starts: a copy of the one announced at the first start, or the bundled one."""
     kept, folder = output / START, data / "detectors" / "camera"
     named = folder / "announced"
     with writing(kept, "free disk space"):

@@ -3,8 +3,7 @@
     POST /api/v1/robots/ROBOT/learning/next            204, or a request with its number in a header; waits for one
     POST /api/v1/robots/ROBOT/learning/reply/NUMBER    204; the reply to a request
 
-They are those of the process in which the fleet learns. The service has checked a robot's token or certificate before
-it passes on its request (``relay``).
+They are of the process in which the fleet learns; the service checks who asks before it passes a request (``relay``).
 """
 
 import asyncio

@@ -147,8 +147,7 @@ def own_examples(folder: Path, side_m: float = HELD_OUT_SIDE_M) -> tuple[Revisit
 
 
 def _picture(frame: KeptKeyframe, version: str) -> GreyImage | None:
-    """The image of a keyframe that the present detector described, in whole cells; None for another one, or if it is
-    broken."""
+    """The image of a keyframe of the present detector, in whole cells; None for another one, or if it is broken."""
     picture = decode_grey(frame.image.encoded) if frame.detector_version == version else None
     return None if picture is None else padded(picture)
 

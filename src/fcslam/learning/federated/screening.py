@@ -30,8 +30,7 @@ SMALLEST_MEDIAN: Final = 3
 WORST_CHANNEL: Final = 8.0
 """A channel may be as many times as far from the median as all channels together."""
 LONGER_THAN_BEFORE: Final = 2.0
-"""Factor by which the previous round's length limit exceeds this round's: they grow at the start of training. It holds
-where most of a round's updates are poisoned."""
+"""Factor by which the previous round's length limit exceeds this round's; it holds where most updates are poisoned."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,9 +55,7 @@ def administration_router(state: ServiceState) -> APIRouter:
                 if run is None:
                     raise HTTPException(404, f"result {number} was removed, because there are several newer ones")
                 return Finalized(
-                    number=number,
-                    run=str(run),
-                    archive=f"/api/v1/missions/{mission.folder.name}/runs/{number}.zip",
+                    number=number, run=str(run), archive=f"/api/v1/missions/{mission.folder.name}/runs/{number}.zip"
                 )
             free = shutil.disk_usage(mission.folder.path).free
             if free < LEAST_FREE_BYTES:

@@ -47,8 +47,7 @@ from fcslam.wire.limits import MAXIMUM_EPOCH
 
 EVENTS = "text/event-stream"
 MOST_STREAMS = 200
-"""Streams at a time: each costs the process a look four times a second. A further one ends the oldest, whose client
-asks again if it is still there."""
+"""Streams at a time: each is looked at four times a second. One more ends the oldest, whose client may ask again."""
 LOOK_S = 0.25
 """How often something that waits looks again: a stream for events, a request for its result."""
 ROUNDS_FILE: Final = "rounds.csv"

@@ -13,8 +13,7 @@ from fcslam.sources.bags.transforms import NoTransformError, TransformTree, plan
 from fcslam.sources.faults import Audit, Fault
 
 SIGMA_M: Final = {0: 5.0, 1: 2.0, 2: 0.5}
-"""Standard deviations of fixes with an unknown covariance, by status: alone, with corrections by satellite, by ground
-stations."""
+"""Standard deviations of fixes without a covariance, by status: alone, corrected by satellite, by ground stations."""
 NO_FIX: Final = -1
 """STATUS_NO_FIX; below, the status is unknown, as in messages that nobody set it in."""
 FIX_INTERVAL_S: Final = 0.9

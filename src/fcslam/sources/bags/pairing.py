@@ -6,8 +6,7 @@ odometry steps back, earlier readings do not count any more.
 
 A reading that was recorded a little late, after one with a later stamp, counts at its time.
 
-Before the first and after the last reading, and where the odometry's clock steps back, a scan gets the pose of the
-nearest reading within 1 s, or none.
+Before the first and after the last reading, and at a step back of their clock, the nearest one within 1 s counts.
 """
 
 from bisect import bisect_right, insort

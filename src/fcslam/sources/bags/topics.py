@@ -66,10 +66,7 @@ class Topics(NamedTuple):
 
 
 def choose_topics(
-    known: KnownTopics,
-    options: BagOptions,
-    field_of_view_rad: Callable[[Topic], float],
-    jumps: Callable[[Topic], bool],
+    known: KnownTopics, options: BagOptions, field_of_view_rad: Callable[[Topic], float], jumps: Callable[[Topic], bool]
 ) -> Topics:
     """Choose the topics of a robot to read, by these rules in order:
 

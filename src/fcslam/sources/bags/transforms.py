@@ -37,8 +37,7 @@ Link = tuple[str, str]
 USUAL_BASES = ("base_footprint", "base_link")
 """Frames of the robot's body, where no message names it."""
 _CORRECTED = ("map", "world", "earth", "utm", "global", "camera_init")
-"""Parts of the names of frames in which a robot drives besides that of its odometry, and where it jumps; the last is of
-LOAM's successors."""
+"""Parts of the names of frames, besides odometry's, in which a robot drives and jumps; the last: LOAM's successors."""
 _NO_ODOMETRY = ("map", *USUAL_BASES)
 """Frames in which a robot jumps, or in which its joints move."""
 IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
