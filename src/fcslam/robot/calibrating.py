@@ -15,13 +15,15 @@ from fcslam.lidar.facing import AS_STATED, MOST_COMPARED, Contradiction, contrad
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.leaning import floor_line
 from fcslam.lidar.own_body import SAME_M, body_radius_m, body_sectors
-from fcslam.records import Beams, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
+from fcslam.lidar3d.ground import seen_by
+from fcslam.records import Beams, CloudScan, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.predicted_motion import PREDICTED, MotionPrediction
 from fcslam.robot.wheel_odometry import is_jump
 from fcslam.sources.bags.options import BagCorrection
+from fcslam.sources.clouds_in_space import BAND_LASER
 from fcslam.sources.contradictions import RepeatedScans
-from fcslam.sources.formats import bag_of
+from fcslam.sources.formats import bag_of, is_whole
 from fcslam.sources.motion import OdometryUpdates
 from fcslam.sources.pose import pose_of
 from fcslam.sources.returns import FloorLine
@@ -126,6 +128,19 @@ def contradictions_of(source: Source) -> tuple[str, ...]:
                 f"{floor}, or leave its beams out by the configuration: robot: {{lidar: {{ignore: [{ignored}]}}}}"
             )
     return tuple(f"{source.name}: {line}" for line in lines)
+
+
+def _turned(source: Source) -> tuple[str, ...]:
+    """A line about a 3D LiDAR whose heading contradicts the wheels, by what a 2D laser would see."""
+    scans = (
+        LaserScan(
+            each.stamp, seen_by(BAND_LASER, *[each.points_m.astype(np.float64)] * 2), BAND_LASER, each.T_odom_base
+        )
+        for each in (source.records() if source.survey().path_length_m else ())
+        if isinstance(each, CloudScan)
+    )
+    found = contradicted_facing(scans)
+    return (f"{source.name}: {found}",) if found is not None and found.facing.turned_deg else ()
 
 
 def _without_tf(found: Contradiction) -> str:
@@ -258,7 +273,7 @@ def calibrated(source: Source, config: LidarConfig) -> Source:
     """A recording with what its motion says against it; only a bag is corrected."""
     bag = bag_of(source)
     if bag is None:
-        said = contradictions_of(source)
+        said = _turned(source) if is_whole(source) else contradictions_of(source)
         return Noted(source, tuple(f"{line}; not corrected" for line in said)) if said else source
     of_clouds = [model for model, its in zip(bag.survey().lasers, bag.plan.lasers, strict=True) if its.is_level]
     radius_m = max((body_radius_m(_scans_of(laser, bag), laser) for laser in of_clouds), default=0.0)
