@@ -128,7 +128,6 @@ def anchored(
 
 
 def _refusal(plan: "BuildingPlan", building: Submap | None, alignment: "PlanAlignment | None") -> str:
-    """Why a map is not aligned with a plan."""
     from fcslam.anchoring.alignment import misfit
 
     if building is None or not len(building.surface):

@@ -60,8 +60,7 @@ class BuildingPlan:
 
     @cached_property
     def submap(self) -> Submap:
-        """Surfaces on both sides of every line, without free space: a plan leaves out furniture, so what it lacks
-        never speaks against it."""
+        """Surfaces on both sides of every line. There is no free space, as a plan leaves out furniture."""
         edges = _edges(self.drawing)
         edges = replace(edges, points=edges.points + self.thickness_m * edges.normals)
         field = SurfelField(edges.points.mean(axis=0))

@@ -22,7 +22,6 @@ LONGEST_CLOSURE_M = 50.0
 WIDEST_SUBMAP_M = 2.0 * LONGEST_CLOSURE_M
 """Largest distance of a keyscan from the anchor of its submap, metres."""
 MOST_SUBMAP_KEYSCANS = 2000
-"""Largest number of keyscans in a submap."""
 HIGHEST_BASE_M = 10.0
 """Largest distance of a base from the floor below it, metres."""
 FARTHEST_TAG_M = LONGEST_CLOSURE_M

@@ -71,8 +71,7 @@ class ClosureLog(Kept):
         self._between: dict[frozenset[str], list[ClosureEntry]] = {}
         """Entries by pair of robots, because every place queries its pairs."""
         self._at: dict[str, dict[int, list[ClosureEntry]]] = {}
-        """Verified entries between robots, by robot and keyscan of each of their two places; a candidate never changes
-        its status."""
+        """Verified entries between robots, by robot and keyscan of both ends; a candidate never changes its status."""
         for entry in entries:
             self._add(copy(entry))
 
@@ -102,8 +101,7 @@ class ClosureLog(Kept):
         return self._add(ClosureEntry(closure, independent=not match.predicted))
 
     def add_local(self, constraint: Constraint, edge: int, tag: Tag | None = None) -> ClosureEntry:
-        """Add a closure that a robot found within its own map, or that a ``tag`` gives there; it is accepted until the
-        joint graph contradicts it."""
+        """Add a closure within a map, by its robot or a ``tag``; accepted until the joint graph contradicts it."""
         found = Reason(ReasonCode.FOUND_BY_ROBOT) if tag is None else Reason(ReasonCode.SAME_TAG, tag.number)
         i, j = KeyscanId(constraint.robot, constraint.i), KeyscanId(constraint.robot, constraint.j)
         channel = Channel.LIDAR if tag is None else Channel.TAG

@@ -58,8 +58,7 @@ class Fleet:
     ) -> None:
         """Start without packets.
 
-        ``verify_pairs`` verifies pairs of submaps, here or on a pool; the result is the same. ``read`` gives stored
-        packets by their numbers, for ``restored``.
+        ``verify_pairs`` verifies pairs of submaps, here or on a pool; ``read`` gives packets by number.
         """
         self._config = config
         self._verify_pairs = verify_pairs

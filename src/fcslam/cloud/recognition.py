@@ -95,8 +95,7 @@ class PlaceRecognition:
     def match_again(self, a: Collection[str], b: Collection[str]) -> Iterator[tuple[str, list[PlaceMatch]]]:
         """Compare the places of two groups of sessions, which shared a map until now, wherever they were not compared.
 
-        In a false joint map, the true pairs of places lie far apart, so they were not compared. Yields a session of b
-        with the matches of each of its places.
+        In a false joint map, true pairs of places lie far apart. Yields a session of b with the matches of a place.
         """
         for key, matcher in self._matchers.items():
             stored = {s: self._places.get((key, s), _NO_PLACES)[:, 0].tolist() for s in (*a, *b)}

@@ -89,7 +89,6 @@ class FleetResult:
     sightings: tuple[TagSighting, ...] = ()
     """Sightings of the tags that the robots saw."""
     space_graph: PoseGraph | None = None
-    """The pose graph in space."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -57,8 +57,7 @@ class SeenTags(Kept):
         self._graph = graph
         self._seen: dict[Tag, dict[str, dict[int, TagSighting]]] = {}
         self._paired: dict[Tag, set[tuple[KeyscanId, str]]] = {}
-        """By tag, each keyscan and the session with which it has a closure: one at most, so that the errors of a
-        sighting are in one closure."""
+        """By tag, each keyscan and the one session with which it has a closure: errors of a sighting count once."""
         self._tags: Counter[KeyscanId] = Counter()
         self._ends: Counter[frozenset[str]] = Counter()
         """Ends of closures by tags between two sessions."""

@@ -193,8 +193,7 @@ class OnnxDetector:
 
 
 def decode_grey(encoded: bytes) -> GreyImage | None:
-    """Decode an image file to 8-bit grey levels (H, W), ignoring its EXIF orientation; None if it is broken or would
-    fill the memory.
+    """Decode an image file to 8-bit grey levels (H, W), without EXIF orientation; None if it is broken or too large.
 
     Colours are weighted as in ITU-R BT.601, transparency is ignored, and 16-bit values keep their upper 8 bits.
     """

@@ -94,8 +94,7 @@ def correspond_predicted(
 ) -> NDArray[np.int64]:
     """Numbers of the keypoints that two images share, shape (M, 2).
 
-    ``pixels`` (K, 2) are where the second image shows the K keypoints of the first, some pixels off; ``shown`` (K,)
-    says which of them it shows.
+    ``pixels`` (K, 2): where the second image shows keypoints of the first, some pixels off; ``shown`` (K,): whether.
     """
     none = np.empty((0, 2), np.int64)
     asked = np.flatnonzero(shown & (len(second.keypoints_px) > 0))

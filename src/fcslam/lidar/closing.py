@@ -55,8 +55,7 @@ overlap too little, metres."""
 LEAST_GAP_M = 1.5 * SIGHT_M
 """Least travel between the anchors of two submaps that are compared, metres."""
 MOST_CANDIDATES = 4
-"""Largest number of earlier visits that a submap is compared with; in a square with more than ``MOST_NEARBY``, one
-closure ties it to the well-known area."""
+"""Most earlier visits that a submap is compared with; one closure ties it to a square of over ``MOST_NEARBY``."""
 UNPACKED = 16 * MOST_CANDIDATES
 """Submaps that are kept ready for comparison, 0.2 MB each."""
 SIMILAR_PLACES = 6 * MOST_CANDIDATES

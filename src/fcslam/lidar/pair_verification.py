@@ -84,8 +84,7 @@ class VerificationPool:
 
     A submap takes longer to send than to compare. Each process keeps those that it got, by a hash of their content.
 
-    ``processes`` gives the other processes that take batches now, each of which runs its tasks one by one; the other
-    arguments are explained at their defaults.
+    ``processes`` gives the other processes that take batches now, one by one each; the others: see their defaults.
     """
 
     def __init__(

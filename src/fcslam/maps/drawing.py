@@ -95,8 +95,7 @@ def map_png(fused: OccupancyMap, trajectories: Mapping[str, FloatArray], closure
     labels = list(colors.items())
     if closures:
         labels.append((f"{len(closures)} closure{'s' * (len(closures) > 1)} between robots", CLOSURE))
-    picture = np.vstack((canvas, _legend(labels, canvas.shape[1], view.cell_px / view.cell_m)))
-    return bytes(cv2.imencode(".png", picture)[1])
+    return _with_legend(canvas, labels, view)
 
 
 def picture(
@@ -127,14 +126,7 @@ def highlighted_png(
     painted = fused.cells.copy()
     painted[appeared], painted[disappeared] = _APPEARED, _DISAPPEARED
     view = _view(replace(fused, cells=painted), ())
-    canvas = _canvas(view)
-    picture = np.vstack(
-        (
-            canvas,
-            _legend(list(zip(labels, CHANGES, strict=True)), canvas.shape[1], view.cell_px / view.cell_m),
-        )
-    )
-    return bytes(cv2.imencode(".png", picture)[1])
+    return _with_legend(_canvas(view), list(zip(labels, CHANGES, strict=True)), view)
 
 
 def _spread(closures: Sequence[FloatArray]) -> list[FloatArray]:
@@ -223,6 +215,11 @@ def _draw_line(canvas: Image, pixels: FloatArray, color: Color, width_px: int) -
 
 def _fixed_point(pixels: FloatArray) -> NDArray[np.int32]:
     return np.rint(pixels * (1 << SUBPIXEL_BITS)).astype(np.int32)
+
+
+def _with_legend(canvas: Image, labels: list[tuple[str, Color]], view: _Viewport) -> bytes:
+    picture = np.vstack((canvas, _legend(labels, canvas.shape[1], view.cell_px / view.cell_m)))
+    return bytes(cv2.imencode(".png", picture)[1])
 
 
 def _legend(labels: list[tuple[str, Color]], width_px: int, pixels_per_m: float) -> Image:

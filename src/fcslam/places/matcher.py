@@ -154,8 +154,7 @@ def _status(matches: bool) -> ClosureStatus:
 
 
 _Comparison = tuple[KeyscanId, Sequence[Motion], bool]
-"""Pairs of one stored place that are to be verified: the place i; possible T_i_j (none: there is no match); and whether
-they are predicted."""
+"""Pairs of a stored place to be verified: the place i; possible T_i_j (none: no match); whether they are predicted."""
 
 
 class PlaceMatcher:

@@ -95,7 +95,6 @@ class RobotFrontend:
         """Source of the motion in the sessions from the next one on."""
         self.packets = PacketQueue(robot, backend or inline(RobotBackend(robot, config)))
         self.newest: NewestScan | None = None
-        """The newest scan; None before the first."""
         self._config, self._mark = config, mark
         self._repeated = RepeatedScans()
         self._mapped = MappedScans(config.lidar.ignore, config.lidar.footprint)

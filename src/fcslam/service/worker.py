@@ -548,7 +548,6 @@ class _Output:
     begun: int = -1
     """How many packets the newest copy writes."""
     copy: Background | None = None
-    """The copy that writes it now."""
     began_s: float = math.inf
     """When the newest copy began."""
 

@@ -39,8 +39,7 @@ class HttpResponse:
     packets: tuple[bytes, ...] = ()
     """Encoded packets from the cloud."""
     refusal: tuple[int, str] | None = None
-    """Index and reason of a packet that the cloud refuses for good; it keeps its sequence number. Packets before it are
-    stored, packets after it are not."""
+    """Index and reason of a packet that is refused for good; only those before it are stored. It keeps its number."""
     refused: int = 0
     """Number of the robot's refused packets so far; some were refused after they were stored."""
     removed: bool = False

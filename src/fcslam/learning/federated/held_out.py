@@ -112,8 +112,7 @@ def _described(network: KeypointNetwork, frame: Keyframe, device: torch.device) 
 
 
 def _recall(a: Keyframe, b: Keyframe, T_a_b: FloatArray, shared: int) -> float:
-    """Keypoints that are the same points by the poses and match by their codes, as a share of the points that both
-    frames are known to show; at most 1."""
+    """Keypoints that are the same by poses and codes, as a share of the points that both frames show; at most 1."""
     matched = {(i, j) for i, j in mutual_matches(a.features.descriptors, b.features.descriptors).pairs.tolist()}
     right = sum((i, j) in matched for i, j in correspond(a, b, T_a_b).tolist())
     return min(right / shared, 1.0)

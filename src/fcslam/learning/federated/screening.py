@@ -76,7 +76,8 @@ def screen(
             refused[robot] = "batch statistics that were to stay as they are have changed"
     for names, earlier in ((parameters, earlier_length), (statistics, 0.0)):
         rest = _vectors(updates, sent, names, refused)
-        refused |= _too_long(rest, float(np.linalg.norm(_vector(sent, names))), earlier, bounds)
+        whole = update_vector(sent, {name: np.zeros_like(sent[name]) for name in names}, names)
+        refused |= _too_long(rest, float(np.linalg.norm(whole)), earlier, bounds)
     refused |= _odd_statistics(updates, refused, bounds)
     return refused | _disagreeing(_vectors(updates, sent, parameters, refused), bounds)
 
@@ -106,10 +107,6 @@ def _vectors(
     updates: Mapping[str, Weights], sent: Weights, names: Sequence[str], refused: Mapping[str, str]
 ) -> dict[str, FloatVector]:
     return {robot: update_vector(updates[robot], sent, names) for robot in updates if robot not in refused}
-
-
-def _vector(weights: Weights, names: Sequence[str]) -> FloatVector:
-    return update_vector(weights, {name: np.zeros_like(weights[name]) for name in names}, names)
 
 
 def _too_long(
