@@ -7,7 +7,8 @@ import pytest
 
 from fcslam.cli import main
 from tests.sources.bag_messages import drive, save, scan
-from tests.sources.clouds import at_rest, spinning
+from tests.sources.clouds import at_rest, rotation, spinning, xyz
+from tests.sources.test_clouds_in_space import drive as drive_3d
 
 pytestmark = pytest.mark.slow
 
@@ -54,6 +55,21 @@ def test_a_folder_of_clouds_is_a_recording_that_can_be_mapped_with_3d(tmp_path, 
         file.write_bytes(b"nonsense")
     assert main(["info", str(tmp_path)]) == 1
     assert "is not a cloud that can be read" in capsys.readouterr().out.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, ["--3d reads /odom, /points, /imu, with times"]),
+        ({"layout": (12, xyz())}, ["--3d reads /odom, /points, /imu", "their order gives them"]),
+        ({"R": rotation(roll=np.pi)}, ["--3d reads /odom, /points, /imu, with times", "the LiDAR is upside down"]),
+    ],
+)
+def test_a_bag_with_clouds_says_what_3d_reads(tmp_path, capsys, changes, said):
+    assert main(["info", str(save(tmp_path / "run.mcap", drive_3d(**changes)))]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    first = lines.index(said[0])
+    assert all(part in lines[first + 1] for part in said[1:])
 
 
 def test_names_of_a_bag_do_not_reach_the_terminal_as_they_are(tmp_path, capsys):

@@ -11,7 +11,7 @@ import typer
 from fcslam.cli.inputs import bag_options, named_path
 from fcslam.cli.options import Sensors
 from fcslam.cli.output import notices
-from fcslam.errors import InputError, printable
+from fcslam.errors import InputError, SourceError, printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -66,7 +66,20 @@ def _with_contradictions(found: "Inspection", options: "BagOptions | None") -> "
     if found.problem is not None:
         return found
     source = open_source(found.path, options)
-    return replace(found, notes=(*found.notes, *contradictions_of(source), *bodies_of(source), *ramps_of(source)))
+    lines = (*contradictions_of(source), *bodies_of(source), *ramps_of(source), *_in_space(found.path, options))
+    return replace(found, notes=(*found.notes, *lines))
+
+
+def _in_space(recording: Path, options: "BagOptions | None") -> tuple[str, ...]:
+    from fcslam.sources import BagOptions, open_source, whole_clouds
+    from fcslam.sources.bags.cloud_bag import CloudBag
+
+    options = replace(options or BagOptions(), in_3d=True)
+    source = whole_clouds(open_source(recording, options), options)
+    try:
+        return source.inputs if isinstance(source, CloudBag) else ()
+    except SourceError as error:
+        return (f"--3d: {error}",)
 
 
 def _calibration(recording: Path, options: "BagOptions | None") -> "Iterator[str]":

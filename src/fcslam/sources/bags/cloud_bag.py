@@ -35,6 +35,13 @@ class CloudBag(CloudRecording):
     def _reader(self) -> tuple[CloudReader, tuple[str, ...]]:
         return self._plan.scans.whole_reader(self._topic)
 
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Lines that say what is read, and what is wrong with the clouds."""
+        plan, (reader, notes) = self._plan, self._reader
+        topics = (*plan.read_topics(with_images=False), *filter(None, (plan.imu,)))
+        return f"--3d reads {', '.join(topic.name for topic in topics)}{', with times' * reader.is_timed}", *notes
+
     def survey(self) -> Survey:
         """As in ``CloudRecording``."""
         _, notes = self._reader
