@@ -22,6 +22,7 @@ LONGEST_CLOSURE_M = 50.0
 WIDEST_SUBMAP_M = 2.0 * LONGEST_CLOSURE_M
 """Largest distance of a keyscan from the anchor of its submap, metres."""
 MOST_SUBMAP_KEYSCANS = 2000
+"""Largest number of keyscans in a submap."""
 HIGHEST_BASE_M = 10.0
 """Largest distance of a base from the floor below it, metres."""
 FARTHEST_TAG_M = LONGEST_CLOSURE_M
@@ -69,8 +70,8 @@ def check_constraint(constraint: Constraint, largest_m: float) -> None:
 def with_least_noise(constraint: Constraint) -> Constraint:
     """The constraint with the precision that scan matching has at best.
 
-    Robots state no more: more points do not reduce the errors of matching that neighbouring points share, nor those of
-    the scanner's calibration (``least_sigmas``, ``CLOSURE_SIGMA_M``). So only false claims change.
+    More points do not reduce the errors of matching that neighbouring points share, nor those of the scanner's
+    calibration (``least_sigmas``, ``CLOSURE_SIGMA_M``). Robots with 2D LiDARs state no more, those with 3D LiDARs do.
     """
     group, sigma_m, sigma_rad = group_of(constraint.T_i_j), CLOSURE_SIGMA_M, CLOSURE_SIGMA_RAD
     if constraint.kind is ConstraintKind.ODOMETRY:
