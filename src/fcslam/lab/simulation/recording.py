@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Final
@@ -15,7 +16,7 @@ from fcslam.geometry import se2
 from fcslam.lab.simulation.drivable_space import CELL_M
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings
 from fcslam.maps.occupancy_map import Cells, Occupancy, OccupancyMap, map_yaml, pgm_bytes
-from fcslam.records import FloatArray, LaserModel, SensorRecord
+from fcslam.records import FloatArray, LaserModel, LaserScan, SensorRecord, frozen
 from fcslam.runs import write_tum
 from fcslam.sources import write_bag
 from fcslam.storage.files import write_file
@@ -51,9 +52,17 @@ def record_robot(robot: SimulatedRobot, folder: Path, watch: Watch = iter) -> No
     ``watch`` receives the records and passes them on; the recording ends when it ends.
     """
     with closing(robot.records()) as records:
-        write_bag(folder, watch(records))
+        write_bag(folder, watch(map(_as_driver, records)))
     with writing(folder, "choose another output folder"):
         write_tum(folder / GROUND_TRUTH, *robot.truth)
+
+
+def _as_driver(record: SensorRecord) -> SensorRecord:
+    """A scan as drivers of ROS send it: a beam without a return is inf."""
+    if not isinstance(record, LaserScan):
+        return record
+    is_far = record.ranges_m >= record.laser.max_range_m
+    return replace(record, ranges_m=frozen(np.where(is_far, np.inf, record.ranges_m), np.float32))
 
 
 def write_ground_truth(fleet: SimulatedFleet, folder: Path) -> None:
