@@ -83,7 +83,8 @@ class Cost:
 def run_fcslam(*arguments: object, environment: Mapping[str, str] | None = None) -> Cost:
     """Run ``fcslam`` with ``arguments`` in a fresh process and measure it; its own failure ends the script."""
     package = str(Path(fcslam.__file__).parents[1])
-    process_environment = {**os.environ, "PYTHONPATH": package, **(environment or {})}
+    # As of most users, who do not keep Python from caching its modules.
+    process_environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "", "PYTHONPATH": package, **(environment or {})}
     command = [sys.executable, "-c", _COMMAND, *map(str, arguments)]
     with tempfile.TemporaryFile() as output:
         began = time.perf_counter()
