@@ -215,6 +215,8 @@ def test_folders_of_clouds_are_recordings(tmp_path, kind):
         (["8", "9", "10"], None),
         (["0", "100", "200"], None),
         (["scan_8", "scan_9", "scan_10"], None),
+        (["inf", "infinity", "nan"], None),
+        (["1e300", "2e300", "3e300"], None),
     ],
 )
 def test_names_of_clouds_give_their_times_or_a_notice_says_what_is_assumed(tmp_path, names, stamps):
@@ -239,6 +241,10 @@ def test_a_broken_file_is_left_out_and_times_must_be_there(tmp_path):
     (tmp_path / "times.txt").write_text("0.0\n0.1\n")
     (source,) = open_fleet([(Path(tmp_path), "anna")], IN_3D)
     with pytest.raises(SourceError, match="has 2 times for 4 clouds"):
+        source.survey()
+    (tmp_path / "times.txt").write_text("0.0\nnan\n0.2\n0.3\n")
+    (source,) = open_fleet([(Path(tmp_path), "anna")], IN_3D)
+    with pytest.raises(SourceError, match="'nan' is not a time"):
         source.survey()
 
 

@@ -7,9 +7,11 @@ mounting, ``base`` is on the floor below the LiDAR.
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import cached_property
 from io import StringIO
+from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
@@ -77,10 +79,9 @@ class CloudFolder(CloudRecording):
                         f"{file}: has {len(lines)} times for {len(self._files)} clouds; give one for each"
                     )
                 return [_seconds(line, file) for line in lines[: len(self._files)]]
-        try:
-            numbers = [float(file.stem) for file in self._files]
-        except ValueError:
+        if not all(re.fullmatch(r"[0-9]{1,19}(\.[0-9]+)?", file.stem) for file in self._files):
             return []
+        numbers = [float(file.stem) for file in self._files]
         if not min(numbers) > _LEAST_TIME and not any("." in file.stem for file in self._files):
             return []
         unit_s = next((unit_s for least, unit_s in _UNITS if numbers[0] >= least), 1.0)
@@ -179,10 +180,9 @@ def _rows(content: bytes, fields: list[tuple[str, str, int]], count: int, is_tex
 
 
 def _seconds(text: str, file: Path) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        pass
+    with suppress(ValueError):
+        if isfinite(seconds := float(text)):
+            return seconds
     try:  # KITTI's raw data has nanoseconds
         stamp = datetime.fromisoformat(text)
         return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp()
