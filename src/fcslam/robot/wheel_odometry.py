@@ -62,7 +62,8 @@ class WheelCheck:
         if self._path.says_something and not stands_still(self._at_rest, scan):
             self._at_rest, self._changed, self.certain_s = scan, 0, scan.stamp
             return False
-        before, now = _in_plane(self._at_rest), _in_plane(scan)
+        self._at_rest = before = _in_plane(self._at_rest)  # once
+        now = _in_plane(scan)
         if now.laser == before.laser:
             share = changed_share(before.ranges_m, now.ranges_m, now.laser.max_range_m)
             self._changed = self._changed + 1 if share > CHANGED else 0
