@@ -22,6 +22,8 @@ from fcslam.runs import (
     prepare_output,
 )
 
+CLOSURE_COLUMNS = "robot_i,stamp_i,robot_j,stamp_j,channel,similarity,x,y,theta,status,reason,value,limit,setting"
+CLOSURE_REST = "lidar,0.5,0,0,0,accepted,fits_joint_graph,,,"
 JOIN_COLUMNS = "robot_i,robot_j,closures,places,seen_m,contradicting_m,likeness,elsewhere"
 
 
@@ -94,9 +96,7 @@ def test_tables_have_the_columns_promised(tmp_path, run):
     assert robots[0] == "robot,map,path_length_m,scans"
     assert robots[2] == "b-2,1,0.000,1"
     closures = (tmp_path / "run" / "closures.csv").read_text().splitlines()
-    assert (
-        closures[0] == "robot_i,stamp_i,robot_j,stamp_j,channel,similarity,x,y,theta,status,reason,value,limit,setting"
-    )
+    assert closures[0] == CLOSURE_COLUMNS
     joins = (tmp_path / "run" / "joins.csv").read_text().splitlines()
     assert joins[0] == JOIN_COLUMNS
     assert joins[2] == "robot_1,étage.0,3,1,,,,"
@@ -202,6 +202,8 @@ def test_what_is_no_run_folder_is_refused(tmp_path):
         ("robots.csv", "robot,map,path_length_m,scans,floor\nrobot_1,0,1,1,<b>\n", "'<b>' is not a floor"),
         ("closures.csv", "robot_i\nrobot_1\n", "closures.csv, line 2"),
         ("closures.csv", None, "closures.csv"),
+        ("closures.csv", f"{CLOSURE_COLUMNS}\nzoe,1,b-2,2,{CLOSURE_REST}\n", "'zoe' has no trajectory"),
+        ("trajectories/b-2.tum", "", "'b-2' has no trajectory"),
         ("joins.csv", "robot_i,robot_j\na,b\n", "joins.csv, line 2"),
         ("joins.csv", f"{JOIN_COLUMNS}\na,b,x,1,,,,\n", "'x'"),
         ("local/robot_1.tum", None, "robot_1.tum"),
@@ -210,6 +212,7 @@ def test_what_is_no_run_folder_is_refused(tmp_path):
         ("metrics.json", "{", "broken"),
         ("metrics.json", '{"a": 1}', "metrics.json"),
         ("metrics.json", "[3]", "metrics.json"),
+        ("metrics.json", f'[{{"name": "a", "value": 1{"0" * 400}, "unit": "m"}}]', "metrics.json"),
         ("config.yaml", None, "config.yaml"),
         ("robots.csv", "\x00\xff", "broken"),
         ("robots.csv", "robot,map,path_length_m,scans\n" + "x" * 200_000 + ",0,1,1\n", "broken"),

@@ -55,9 +55,10 @@ def test_a_map_without_a_known_place_has_no_geotiff(tmp_path):
     (tmp_path / "map.yaml").write_text(map_yaml(MAP, "map.pgm"))
     assert export_map(tmp_path, 0, "svg") == map_svg(MAP).encode()
     place = tmp_path / "map_georeference.json"
-    for text in (None, '{"georeferenced": false, "reason": "too few"}', '{"latitude_deg": 91}', "[" * 100_000, "{}"):
-        if text is not None:
-            place.write_text(text)
+    refusal = b'{"georeferenced": false, "reason": "too few"}'
+    for content in (None, refusal, b'{"latitude_deg": 91}', b"[" * 100_000, b"{}", b"\xff"):
+        if content is not None:
+            place.write_bytes(content)
         assert earth_frame(tmp_path, 0) is None
         assert export_map(tmp_path, 0, "tif") is None
     place.write_text(FRAME.model_dump_json())

@@ -84,12 +84,16 @@ def test_a_placed_map_keeps_its_frame_when_a_solution_moves_it_a_little():
     assert frame not in {frame_of(*other) for other in others}
 
 
+HEAD = b'{"frame":"a","version":1,"resolution":0.05,"complete":true,"tiles":[]}'
+
+
 @pytest.mark.parametrize("data", [
-    b"", b"[]\n", b'{"frame":"a","version":1,"resolution":0.05,"complete":true,"tiles":[[0,0,9]]}\nabc',
-    b'{"frame":"a","version":1,"resolution":-1,"complete":true,"tiles":[]}\n',
-    b'{"frame":"a","version":1,"resolution":0.05,"complete":true,"tiles":[[0,0,-1]]}\n',
+    b"", b"[]", b"[" * 100_000, HEAD.replace(b"[]", b"[[0,0,9]]") + b"\nabc", HEAD.replace(b"[]", b"[[0,0,-1]]"),
+    HEAD.replace(b"[]", b"[[1e999,0,0]]"), HEAD.replace(b"1,", b"1e999,"), HEAD.replace(b"0.05", b"-1"),
+    HEAD.replace(b"0.05", b"1" + b"0" * 400),
 ])  # fmt: skip
 def test_what_is_no_batch_is_refused(data):
+    assert decode_batch(HEAD).is_complete
     with pytest.raises(ValueError, match="not tiles of a map"):
         decode_batch(data)
 

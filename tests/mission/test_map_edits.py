@@ -58,6 +58,9 @@ def test_a_map_that_is_not_there_is_named():
     ):
         with pytest.raises(InputError, match="there is no map 2; there are 0, 1"):
             ask()
+    nothing_seen = Run({"a": RobotTrajectory("a", 0, STAMPS[:0], POSES[:0])})
+    with pytest.raises(InputError, match="there is no map 0; there are none"):
+        moved_map(nothing_seen, EMPTY, 0, np.zeros(3))
 
 
 def building(turned_rad):

@@ -10,7 +10,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from fcslam.maps.occupancy_map import GEOREFERENCE, Occupancy, OccupancyMap, map_stem, parse_map, pixels_of
 from fcslam.untrusted import MOST_TEXT_BYTES, read_bytes, read_text
@@ -40,7 +40,7 @@ def earth_frame(folder: Path, number: int) -> EarthFrame | None:
         return EarthFrame.model_validate_json(
             read_text(folder / (map_stem(number) + GEOREFERENCE), folder, MOST_TEXT_BYTES)
         )
-    except (OSError, ValidationError):  # no fixes, or they were refused
+    except (OSError, ValueError):  # no fixes, or they were refused
         return None
 
 

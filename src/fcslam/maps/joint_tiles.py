@@ -73,7 +73,7 @@ def decode_batch(data: bytes) -> TileBatch:
         if at != len(body) or not 1e-3 <= resolution_m <= 100.0:
             raise ValueError("sizes do not add up")
         return TileBatch(str(head["frame"]), int(head["version"]), resolution_m, bool(head["complete"]), tiles)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"these are not tiles of a map: {error}") from error
 
 

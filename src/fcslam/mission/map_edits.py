@@ -64,11 +64,11 @@ def motion_to_points(points: Sequence[tuple[float, float]], targets: Sequence[tu
 
 def _keyscans(run: Run, mission: SavedMission, map_index: int) -> Iterator[tuple[str, float, FloatArray]]:
     """Session, stamp and T_map_base of the keyscans of a map."""
-    sessions = [t for t in run.trajectories.values() if t.map_index == map_index]
-    if not sessions:
-        known = sorted({trajectory.map_index for trajectory in run.trajectories.values()})
-        raise InputError(f"there is no map {map_index}; there are {', '.join(map(str, known))}")
-    for trajectory in sessions:
+    sessions = [trajectory for trajectory in run.trajectories.values() if len(trajectory.stamps)]
+    known = sorted({trajectory.map_index for trajectory in sessions})
+    if map_index not in known:
+        raise InputError(f"there is no map {map_index}; there are {', '.join(map(str, known)) or 'none'}")
+    for trajectory in (session for session in sessions if session.map_index == map_index):
         track = mission.tracks.get(trajectory.robot)
         every = np.ones(len(trajectory.stamps), bool)
         rows = every if track is None or len(track.stamps) != len(every) else ~track.T_keyscan_base.any(axis=1)

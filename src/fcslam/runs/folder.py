@@ -180,9 +180,10 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
         robots = read_robots(path / ROBOTS, path)
         pictures = [*path.glob("map*.*"), *path.glob("plan.*"), *path.glob(RMF_YAML)]
         own_maps = robots if maps and (path / LOCAL).exists() else ()
+        trajectories = {robot: _read_trajectory(path, robot, *where) for robot, where in robots.items()}
         return Run(
-            trajectories={robot: _read_trajectory(path, robot, *where) for robot, where in robots.items()},
-            closures=read_closures(path / CLOSURES, path),
+            trajectories=trajectories,
+            closures=read_closures(path / CLOSURES, trajectories, path),
             joins=read_joins(path / JOINS, path) if (path / JOINS).exists() else (),
             metrics=read_metrics(path / METRICS, path),
             config_yaml=read_text(path / CONFIG, path),

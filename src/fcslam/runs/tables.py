@@ -7,7 +7,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -108,9 +108,15 @@ def write_closures(path: Path, closures: Iterable[ClosureRow]) -> None:
     _write_csv(path, _CLOSURE_COLUMNS, map(_closure_fields, closures))
 
 
-def read_closures(path: Path, within: Path | None = None) -> tuple[ClosureRow, ...]:
-    """Every line of closures.csv."""
-    return tuple(_read_closure(row) for row in _read_csv(path, _CLOSURE_COLUMNS, within))
+def read_closures(
+    path: Path, trajectories: Mapping[str, RobotTrajectory], within: Path | None = None
+) -> tuple[ClosureRow, ...]:
+    """Every line of closures.csv; both ends are on ``trajectories``."""
+    closures = tuple(_read_closure(row) for row in _read_csv(path, _CLOSURE_COLUMNS, within))
+    for robot in {robot for closure in closures for robot in (closure.robot_i, closure.robot_j)}:
+        if robot not in trajectories or not len(trajectories[robot].stamps):
+            raise ValueError(f"{path.name}: '{robot[:64]}' has no trajectory")
+    return closures
 
 
 def write_joins(path: Path, joins: Iterable[Join]) -> None:
@@ -172,13 +178,14 @@ def read_metrics(path: Path, within: Path | None = None) -> dict[str, Metric]:
         return _unique(
             path.name, ((row["name"], Metric(row["name"], v, row["unit"])) for row, v in zip(rows, values, strict=True))
         )
-    except (KeyError, TypeError, RecursionError) as error:
+    except (KeyError, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(f"{path.name} is not a list of name, value, unit") from error
 
 
 def _number(value: object) -> float:
     if not isinstance(value, int | float):
         raise TypeError(f"{value!r} is not a number")
+    float(value)  # raises OverflowError for an integer beyond all floats
     return value
 
 
