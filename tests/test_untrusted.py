@@ -20,6 +20,7 @@ from fcslam import untrusted
 from fcslam.config import load
 from fcslam.errors import InputError, SourceError
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
+from fcslam.mission.localization import read_map
 from fcslam.mission.mission import MissionConfig
 from fcslam.runs import RobotTrajectory, Run, open_run
 from fcslam.sources import open_source
@@ -183,7 +184,7 @@ MERGES = "a0: &a0 {x: 1}\n" + "".join(f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 
 @pytest.fixture
 def run(tmp_path):
     """A run folder that can be read."""
-    drawn = OccupancyMap(np.full((1, 1), Occupancy.OCCUPIED, np.uint8), 0.05, (0.0, 0.0))
+    drawn = OccupancyMap(np.array([[Occupancy.OCCUPIED, Occupancy.FREE]], np.uint8), 0.05, (0.0, 0.0))
     files = {"map.pgm": pgm_bytes(drawn), "map.yaml": map_yaml(drawn, "map.pgm").encode()}
     Run({"a": RobotTrajectory("a", 0, np.zeros(1), np.zeros((1, 3)))}, map_files=files).save(tmp_path / "run")
     return tmp_path / "run"
@@ -206,6 +207,14 @@ def test_a_run_folder_reads_no_file_but_its_own(run, tmp_path, name, kind):
         open_run(run)
     assert SECRET not in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_table_of_the_run_in_which_a_robot_is_localized_is_its_own(run, tmp_path):
+    assert read_map(run).cells.any()
+    (run / "robots.csv").rename(tmp_path / "private")
+    (run / "robots.csv").symlink_to(tmp_path / "private")
+    with pytest.raises(InputError, match="is a link"):
+        read_map(run)
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,7 @@ def pose_in_map(name: str, given: ArrayLike, occupancy: OccupancyMap) -> FloatAr
 
 def _floors(folder: Path) -> dict[int, str]:
     try:
-        return dict(read_robots(folder / ROBOTS).values())
+        return dict(read_robots(folder / ROBOTS, folder).values())
     except (OSError, ValueError, csv.Error) as error:
         raise SourceError(f"{folder}: a damaged run folder ({one_line(str(error))})") from error
 

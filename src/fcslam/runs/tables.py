@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 
 from fcslam.errors import InputError
+from fcslam.geometry import se3
 from fcslam.records import FLOOR, Channel, ClosureStatus, FloatArray, Reason, ReasonCode, frozen
 from fcslam.runs.records import ClosureRow, Join, LocalizedPoses, Metric, RobotTrajectory
 from fcslam.untrusted import read_text
@@ -24,10 +25,11 @@ _Value = TypeVar("_Value")
 _ROBOT_COLUMNS = ["robot", "map", "path_length_m", "scans"]
 _FLOOR = "floor"
 """Last column of robots.csv, if a robot names its floor."""
-_CLOSURE_ENDS = ["robot_i", "stamp_i", "robot_j", "stamp_j"]
 _LOCALIZED_COLUMNS = ["stamp", "x", "y", "theta", "sigma_x", "sigma_y", "sigma_theta", "quality"]
-_REASON_COLUMNS = ["reason", "value", "limit", "setting"]
-_CLOSURE_COLUMNS = [*_CLOSURE_ENDS, "channel", "similarity", "x", "y", "theta", "status", *_REASON_COLUMNS]
+_CLOSURE_COLUMNS = [
+    *("robot_i", "stamp_i", "robot_j", "stamp_j", "channel", "similarity", "x", "y", "theta"),
+    *("status", "reason", "value", "limit", "setting"),
+]
 _JOIN_COLUMNS = [field.name for field in fields(Join)]
 _SPACE_LINE = "%.9f" + 7 * " %.9f" + "\n"
 _TUM_LINE = "%.9f %.9f %.9f 0 0 0 %.9f %.9f\n"
@@ -53,15 +55,7 @@ def write_tum(path: Path | BinaryIO, stamps: FloatArray, T_map_base: FloatArray)
 def read_tum(path: Path, within: Path | None = None) -> tuple[FloatArray, FloatArray]:
     """Stamps (N,) and poses (N, 3) in the plane of a TUM file, in its order."""
     stamps, poses = read_tum_6d(path, within)
-    return stamps, in_plane(poses)
-
-
-def in_plane(poses: FloatArray) -> FloatArray:
-    """x, y and heading, shape (N, 3), of poses (N, 7)."""
-    x, y, z, w = poses[:, 3:].T
-    tilted = x.any() or y.any()
-    theta = np.arctan2(2.0 * (x * y + z * w), 1.0 - 2.0 * (y * y + z * z)) if tilted else 2.0 * np.arctan2(z, w)
-    return frozen(np.column_stack((poses[:, :2], np.arctan2(np.sin(theta), np.cos(theta)))))
+    return stamps, frozen(se3.to_plane(poses))
 
 
 def read_tum_6d(path: Path, within: Path | None = None) -> tuple[FloatArray, FloatArray]:
@@ -91,7 +85,7 @@ def write_robots(path: Path, trajectories: Iterable[RobotTrajectory]) -> None:
     _write_csv(path, columns, (row[: len(columns)] for row in fields))
 
 
-def read_robots(path: Path, within: Path | None = None) -> dict[str, tuple[int, str]]:
+def read_robots(path: Path, within: Path) -> dict[str, tuple[int, str]]:
     """Map index and floor by robot, in the order of robots.csv."""
     rows = _read_csv(path, _ROBOT_COLUMNS, within)
     return _unique(path.name, ((row["robot"], (int(row["map"]), _floor(row.get(_FLOOR) or ""))) for row in rows))
@@ -108,9 +102,7 @@ def write_closures(path: Path, closures: Iterable[ClosureRow]) -> None:
     _write_csv(path, _CLOSURE_COLUMNS, map(_closure_fields, closures))
 
 
-def read_closures(
-    path: Path, trajectories: Mapping[str, RobotTrajectory], within: Path | None = None
-) -> tuple[ClosureRow, ...]:
+def read_closures(path: Path, within: Path, trajectories: Mapping[str, RobotTrajectory]) -> tuple[ClosureRow, ...]:
     """Every line of closures.csv; both ends are on ``trajectories``."""
     closures = tuple(_read_closure(row) for row in _read_csv(path, _CLOSURE_COLUMNS, within))
     for robot in {robot for closure in closures for robot in (closure.robot_i, closure.robot_j)}:
@@ -130,7 +122,7 @@ def _cell(value: str | float) -> str | float:
     return "" if math.isnan(value) else f"{value:.6f}"
 
 
-def read_joins(path: Path, within: Path | None = None) -> tuple[Join, ...]:
+def read_joins(path: Path, within: Path) -> tuple[Join, ...]:
     """Every line of joins.csv."""
     return tuple(
         Join(
@@ -151,7 +143,7 @@ def write_localized(path: Path, poses: LocalizedPoses) -> None:
     _write_csv(path, _LOCALIZED_COLUMNS, fields)
 
 
-def read_localized(path: Path, within: Path | None = None) -> LocalizedPoses:
+def read_localized(path: Path, within: Path) -> LocalizedPoses:
     """Every line of localization/<robot>.csv."""
     rows = [
         [float(row[column] or "nan") for column in _LOCALIZED_COLUMNS]
@@ -170,7 +162,7 @@ def metrics_json(metrics: Iterable[Metric]) -> str:
     return json.dumps(rows, indent=2) + "\n"
 
 
-def read_metrics(path: Path, within: Path | None = None) -> dict[str, Metric]:
+def read_metrics(path: Path, within: Path) -> dict[str, Metric]:
     """Every metric of metrics.json by its name; null is NaN."""
     try:
         rows = json.loads(read_text(path, within))
@@ -228,7 +220,7 @@ def _write_csv(path: Path, columns: list[str], rows: Iterable[list[Any]]) -> Non
         writer.writerows(rows)
 
 
-def _read_csv(path: Path, columns: list[str], within: Path | None = None) -> list[dict[str, str]]:
+def _read_csv(path: Path, columns: list[str], within: Path) -> list[dict[str, str]]:
     reader = csv.DictReader(io.StringIO(read_text(path, within), newline=""))
     rows, heading = list(reader), list(reader.fieldnames or ())
     if not rows and not set(columns) <= set(heading):
