@@ -134,7 +134,7 @@ def test_settings_come_from_a_model_a_mapping_or_a_file(tmp_path):
         ({"config": {"sed": 1}}, fcslam.InputError, "did you mean 'seed'"),
         ({"config": "none.yaml"}, fcslam.InputError, "none.yaml"),
         ({"vetoes": [fcslam.Veto("nobody", "robot_1")]}, fcslam.InputError, "nobody"),
-        ({"output": "LOG"}, fcslam.InputError, "is not a run folder"),
+        ({"output": "LOG"}, fcslam.InputError, "does not hold a run"),
         ({"bag_options": fcslam.BagOptions(scan_topics=("/scan",))}, fcslam.SourceError, "ROS bags only"),
     ],
 )

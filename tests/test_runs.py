@@ -134,7 +134,7 @@ def test_a_second_run_needs_force_and_leaves_nothing_of_the_first(tmp_path, run)
 def test_a_folder_that_is_no_run_is_never_replaced(tmp_path, run, force):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter1.tex").write_text("years of work")
-    with pytest.raises(InputError, match="is not a run folder"):
+    with pytest.raises(InputError, match="does not hold a run"):
         run.save(tmp_path / "thesis", force=force)
     assert (tmp_path / "thesis" / "chapter1.tex").read_text() == "years of work"
 

@@ -32,8 +32,9 @@ def uncached() -> bool:
 
 def is_compiled(function: Any) -> bool:
     """Whether the cache has machine code for a compiled function as its source is now."""
-    cache = function._cache
-    return isinstance(cache, _Cache) and cache.has_code()
+    with suppress(OSError):
+        return isinstance(function._cache, _Cache) and bool(function._cache._cache_file._load_index())
+    return False
 
 
 def njit(function: Any = None, *, nogil: bool = False, allocates: bool = True) -> Any:
@@ -119,12 +120,6 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError), self._locked():
             super().save_overload(sig, data)
-
-    def has_code(self) -> bool:
-        """Whether anything is stored for the present source."""
-        with suppress(OSError):
-            return bool(self._cache_file._load_index())
-        return False
 
     @contextmanager
     def _locked(self) -> Iterator[None]:

@@ -161,10 +161,10 @@ def _refused(reason: str, where: Any) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=reason, problem_mark=where.start_mark)
 
 
-def parse_yaml(text: str | bytes, most: int = MOST_TEXT_BYTES) -> Any:
+def parse_yaml(text: str | bytes) -> Any:
     """Content of YAML text of unknown origin."""
-    if len(text) > most:
-        raise ValueError(f"{len(text)} characters of YAML; the limit is {most}")
+    if len(text) > MOST_TEXT_BYTES:
+        raise ValueError(f"{len(text)} characters of YAML; the limit is {MOST_TEXT_BYTES}")
     try:
         return yaml.load(text, _PlainLoader)
     except Exception as error:  # beside its own errors, those of its constructors: recursion, dates, numbers, ...

@@ -71,6 +71,10 @@ def test_all_of_a_recording_arrives(log, cloud, tmp_path, capsys):
     assert (state / "outbox.sqlite").stat().st_mode & 0o077 == 0
     assert main(["play", str(log), "--server", cloud.url, "--state", str(state), "--resume"]) == 0
     assert len(cloud.cloud.stored) == len(stored), "nothing twice"
+    (state / "trajectory.tum").unlink()
+    (state / "trajectory.tum").mkdir()
+    assert main(["play", str(log), "--server", cloud.url, "--state", str(state), "--resume"]) == 2
+    assert "trajectory.tum: cannot be written (Is a directory)" in capsys.readouterr().err
     (state / "keyframes").mkdir()
     assert main(["play", f"bob={log}", "--server", cloud.url, "--state", str(state), "--learn"]) == 2
     assert "belongs to robot 'alice'" in capsys.readouterr().err

@@ -103,7 +103,7 @@ WRONG = [
     ("map r.log --tags pic.png", "give a YAML file of surveyed tags", ""),
     # Output
     ("map r.log -o run", "run: already holds a run; name a new folder or give --force", "map r.log -o run --force"),
-    ("map r.log -o notes.txt", "notes.txt: exists and is not a run folder; name a new folder", ""),
+    ("map r.log -o notes.txt", "notes.txt: exists and does not hold a run; name a new folder", ""),
     ("map r.log -o notes.txt/run", "notes.txt/run: cannot be used as the output folder", ""),
     ("show run --html run", "run: exists; name a new file", "show run --html report.html"),
     ("show run --html no/report.html", "cannot be written (No such file or directory: 'no/", ""),

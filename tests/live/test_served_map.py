@@ -107,7 +107,7 @@ def test_a_new_copy_replaces_the_earlier_one(tmp_path):
 def test_a_folder_with_something_else_stays_as_it_is(floors, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
-    with pytest.raises(InputError, match="exists and is not a run folder"):
+    with pytest.raises(InputError, match="exists and does not hold a run"):
         fetch_maps(tmp_path / "mine", Server(floors))
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["letter.txt"]
 

@@ -106,7 +106,7 @@ def test_a_folder_is_replaced_with_force_only_and_only_if_it_holds_changes(three
     fcslam.changes(three_days, output=tmp_path / "week", force=True)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("dear")
-    with pytest.raises(InputError, match="holds no changes; name a new folder"):
+    with pytest.raises(InputError, match="does not hold changes; name a new folder"):
         fcslam.changes(three_days, output=tmp_path / "other", force=True)
     assert (tmp_path / "other" / "letter.txt").read_text() == "dear"
 

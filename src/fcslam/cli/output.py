@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 RUNS, RECORDINGS, FEATURES, TRAINING = "runs", "recordings", "features", "training"
 CHANGES = "changes"
 """Default parents of output folders."""
+ELSEWHERE = "choose another place"
+"""Advice where a file or folder cannot be written."""
 MOST_NAMES = 6
 """Sessions of a map that are named; of more, the number is printed."""
 

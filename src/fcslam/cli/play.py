@@ -28,7 +28,7 @@ from fcslam.cli.options import (
 from fcslam.cli.output import notices, once_printer, print_line
 from fcslam.cli.training_options import Learn, learning_plan
 from fcslam.cli.warm_up import compiled, copied_process
-from fcslam.errors import InputError, PacketError
+from fcslam.errors import InputError, PacketError, writing
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -235,7 +235,8 @@ def _report(robot: "Robot", state: Path, server: str) -> None:
         typer.echo(f"{lost}; {_localization(now, now.times_lost)}")
     if now.map_index is not None:
         trajectory = robot.trajectory()
-        write_tum(state / "trajectory.tum", trajectory.stamps, trajectory.poses)
+        with writing(state / "trajectory.tum"):
+            write_tum(state / "trajectory.tum", trajectory.stamps, trajectory.poses)
         typer.echo(f"trajectory in map {now.map_index}: {state / 'trajectory.tum'}")
     else:
         typer.echo("no correction came before the end, so there is no trajectory.tum; the result of the service has it")

@@ -13,8 +13,8 @@ import typer
 from fcslam.cli.inputs import is_live, live_source, open_recording, print_faults
 from fcslam.cli.live import stopping
 from fcslam.cli.options import Force, Quiet, Sensors
-from fcslam.cli.output import notices, print_line
-from fcslam.errors import InputError
+from fcslam.cli.output import ELSEWHERE, notices, print_line
+from fcslam.errors import InputError, writing
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -100,26 +100,25 @@ def _convert(log: str, output: Path, sensors: list[str] | None, force: bool, con
             if isinstance(record, LaserScan):
                 advance()
 
-    try:
-        with ProgressDisplay(console) as display, TemporaryDirectory(prefix=".", dir=output.parent) as staging:
-            whole = Path(staging, output.name)
-            write_bag(whole, records())
-            if output.is_dir():
-                shutil.rmtree(output)
-            whole.replace(output)
-    except OSError as error:
-        raise InputError(f"{output}: cannot be written ({error}); choose another place") from error
+    with (
+        writing(output, ELSEWHERE),
+        ProgressDisplay(console) as display,
+        TemporaryDirectory(prefix=".", dir=output.parent) as staging,
+    ):
+        whole = Path(staging, output.name)
+        write_bag(whole, records())
+        if output.is_dir():
+            shutil.rmtree(output)
+        whole.replace(output)
     print_faults(console, {source.name: source.faults})
     typer.echo(f"{survey.scan_count} scans: {output}")
 
 
 def _prepare(output: Path, force: bool) -> None:
     """Check before the work that ``output`` can be written, and create its parents."""
-    try:
+    with writing(output, ELSEWHERE):
         output.parent.mkdir(parents=True, exist_ok=True)
         if output.exists() and not force:
             raise InputError(f"{output}: exists; choose another name or give --force to replace it")
         if output.is_dir() and (output.suffix or not (output / "metadata.yaml").is_file()):
             raise InputError(f"{output}: is a folder, not a recording; choose another name")
-    except OSError as error:
-        raise InputError(f"{output}: cannot be written ({error}); choose another place") from error

@@ -9,7 +9,8 @@ import typer
 
 from fcslam.cli.listening import listen
 from fcslam.cli.options import Force
-from fcslam.errors import InputError
+from fcslam.cli.output import ELSEWHERE
+from fcslam.errors import InputError, writing
 
 LARGEST_BYTES = 2 * 2**30
 """Largest total size of the files of a run folder: the page's server holds most of them in memory."""
@@ -46,10 +47,8 @@ def show(
     with ShownRun(run) as shown:
         if html is not None:
             content = asyncio.run(report_html(shown)).encode()
-            try:
+            with writing(html, ELSEWHERE):
                 write_file(html, content)
-            except OSError as error:
-                raise InputError(f"{html}: cannot be written ({error}); choose another place") from error
             typer.echo(f"report of {run}: {html} ({len(content) / 1e6:.1f} MB)")
             return
         from fcslam.page.routes import run_page, serve_page

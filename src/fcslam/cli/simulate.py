@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fcslam.cli.options import BuildingSeed, NoCamera, PathLength, chosen_settings, output_option
-from fcslam.cli.output import RECORDINGS, new_folder, notices, print_line
-from fcslam.errors import InputError
+from fcslam.cli.output import ELSEWHERE, RECORDINGS, new_folder, notices, print_line
+from fcslam.errors import writing
 from fcslam.lab.simulation.options import Building, Lighting, OdometryKind, Scanner
 
 if TYPE_CHECKING:
@@ -117,10 +117,8 @@ def record_fleet(fleet: "SimulatedFleet", output: Path, console: "Console") -> l
             finally:
                 stopped.set()
         display.start("writing")
-        try:
+        with writing(output, f"make room or {ELSEWHERE}"):
             write_ground_truth(fleet, output)
-        except OSError as error:
-            raise InputError(f"{output}: cannot be written ({error}); make room or choose another place") from error
     _report(fleet, recordings, time.perf_counter() - began, console)
     return recordings
 

@@ -14,13 +14,14 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fcslam.cloud.sessions import in_session
-from fcslam.errors import InputError, SourceError
+from fcslam.errors import SourceError, writing
 from fcslam.maps.changes import APPEARED, DISAPPEARED, Changes, compare
 from fcslam.maps.fusion import Period, fuse_periods, periods_of
 from fcslam.maps.occupancy_map import OccupancyMap, server_files
 from fcslam.mission.mission_file import SavedMission
 from fcslam.records import SAME_STAMP_S, FloatArray, Keyscan, LaserModel
 from fcslam.runs import Run
+from fcslam.runs.folder import prepare_folder
 from fcslam.storage.files import replacing_folder
 from fcslam.wire.messages import Hello
 
@@ -64,32 +65,23 @@ def changes_of(
     return compare(maps, periods[first : last + 1])
 
 
-def save_changes(changes: Changes, folder: Path, force: bool = False) -> None:
+def save_changes(changes: Changes, folder: Path, force: bool) -> None:
     """Write the changes into a new folder, whole or not at all.
 
     ``appeared`` and ``disappeared`` are maps for ROS map_server: occupied cells changed, free ones did not.
     """
-    check_output(folder, force)
-    try:
-        folder.resolve().parent.mkdir(parents=True, exist_ok=True)
-        with replacing_folder(folder.resolve()) as place:
-            for kind, mask in ((APPEARED, changes.appeared), (DISAPPEARED, changes.disappeared)):
-                for name, content in server_files(kind, changes.layer(mask)).items():
-                    (place / name).write_bytes(content)
-            (place / PICTURE).write_bytes(changes.png())
-            (place / TABLE).write_text(_table(changes), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{folder}: cannot write the changes ({error})") from error
+    place = check_output(folder, force)
+    with writing(place, "name another folder"), replacing_folder(place) as staging:
+        for kind, mask in ((APPEARED, changes.appeared), (DISAPPEARED, changes.disappeared)):
+            for name, content in server_files(kind, changes.layer(mask)).items():
+                (staging / name).write_bytes(content)
+        (staging / PICTURE).write_bytes(changes.png())
+        (staging / TABLE).write_text(_table(changes), encoding="utf-8")
 
 
-def check_output(folder: Path, force: bool = False) -> None:
+def check_output(folder: Path, force: bool) -> Path:
     """Check, before the work, that changes can be written to ``folder``."""
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return
-    if not (folder / TABLE).is_file():
-        raise InputError(f"{folder}: exists and holds no changes; name a new folder")
-    if not force:
-        raise InputError(f"{folder}: already holds changes; name a new folder or give --force to replace them")
+    return prepare_folder(folder, force, "changes", lambda place: (place / TABLE).is_file())
 
 
 def _table(changes: Changes) -> str:

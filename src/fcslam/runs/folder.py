@@ -23,17 +23,17 @@ A run folder is whole or not there: it is written into a hidden folder beside it
 import csv
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-from fcslam.errors import InputError
+from fcslam.errors import InputError, writing
+from fcslam.geometry import se3
 from fcslam.maps.occupancy_map import RMF_YAML, OccupancyMap, parse_map
-from fcslam.records import StrPath
+from fcslam.records import StrPath, frozen
 from fcslam.runs.records import LocalizedPoses, LocalMap, RobotTrajectory, RunTables
 from fcslam.runs.tables import (
-    in_plane,
     metrics_json,
     read_closures,
     read_joins,
@@ -110,15 +110,17 @@ class Run(RunTables):
         """
         check_names([*self.trajectories, *self.local_maps, *self.map_files])
         place = prepare_output(Path(folder), force)
-        try:
-            with replacing_folder(place) as staging:
-                _write(self, staging)
-        except OSError as error:
-            raise InputError(f"{place}: cannot write the run ({error}); name another folder") from error
+        with writing(place, "name another folder"), replacing_folder(place) as staging:
+            _write(self, staging)
 
 
 def prepare_output(path: Path, force: bool = False) -> Path:
     """Check, before the long work, that a run folder can be put at ``path``; its parents are made."""
+    return prepare_folder(path, force, "a run", is_run_folder)
+
+
+def prepare_folder(path: Path, force: bool, content: str, holds_content: Callable[[Path], bool]) -> Path:
+    """As ``prepare_output``, for a folder of which ``holds_content`` says whether it holds ``content``."""
     place = path.resolve()
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -130,11 +132,11 @@ def prepare_output(path: Path, force: bool = False) -> Path:
         raise InputError(f"{path}: no permission to write in {place.parent}")
     if place == Path.cwd() or os.path.ismount(place):
         raise InputError(f"{path}: cannot be replaced as a whole; name a new folder inside it")
-    if occupied and not (place.is_dir() and is_run_folder(place)):
-        raise InputError(f"{path}: exists and is not a run folder; name a new folder")
+    if occupied and not (place.is_dir() and holds_content(place)):
+        raise InputError(f"{path}: exists and does not hold {content}; name a new folder")
     if occupied and not force:
         raise InputError(
-            f"{path}: already holds a run; name a new folder or give --force (in Python force=True) to replace it"
+            f"{path}: already holds {content}; name a new folder or give --force (in Python force=True) to replace it"
         )
     return place
 
@@ -183,7 +185,7 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
         trajectories = {robot: _read_trajectory(path, robot, *where) for robot, where in robots.items()}
         return Run(
             trajectories=trajectories,
-            closures=read_closures(path / CLOSURES, trajectories, path),
+            closures=read_closures(path / CLOSURES, path, trajectories),
             joins=read_joins(path / JOINS, path) if (path / JOINS).exists() else (),
             metrics=read_metrics(path / METRICS, path),
             config_yaml=read_text(path / CONFIG, path),
@@ -233,7 +235,7 @@ def _read_trajectory(folder: Path, robot: str, map_index: int, floor: str) -> Ro
         raise ValueError(f"{ROBOTS}: {robot!r} is not a robot's name")
     stamps, poses = read_tum_6d(folder / TRAJECTORIES / f"{robot}.tum", folder)
     in_space = poses if poses[:, 2:5].any() else None
-    return RobotTrajectory(robot, map_index, stamps, in_plane(poses), floor, in_space)
+    return RobotTrajectory(robot, map_index, stamps, frozen(se3.to_plane(poses)), floor, in_space)
 
 
 def _read_local_map(run: Path, robot: str) -> LocalMap:
