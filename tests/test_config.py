@@ -62,17 +62,20 @@ def test_a_file_overrides_only_what_it_names(tmp_path):
         ({"sede": 1}, "unknown key 'sede'; did you mean 'seed'"),
         ({"inner": {"reach": 1}}, "unknown key 'inner.reach'; did you mean 'inner.reach_m'"),
         ({"zzz": 1}, "known keys: seed, name, limit, colour, inner"),
-        ({"inner": {"reach_m": -1}}, "inner.reach_m: Input should be greater than 0"),
+        ({"inner": {"reach_m": -1}}, "inner.reach_m: Input should be greater than 0 (given: -1)"),
         ({"inner": {"reach_m": float("nan")}}, "inner.reach_m"),
         ({"inner": 3}, "inner"),
         ({"colour": "green"}, "colour"),
     ],
 )
 def test_what_does_not_belong_is_named(content, message):
-    with pytest.raises(InputError, match="robot") as caught:
-        parse(Outer, content, "robot.yaml")
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
+    for refuse, where in (
+        (lambda: parse(Outer, content, "robot.yaml"), "robot.yaml"),
+        (lambda: Outer(**content), "Outer"),
+    ):
+        with pytest.raises(InputError, match=f"^{where}: [^\n]+$") as caught:
+            refuse()
+        assert message in str(caught.value)
 
 
 @pytest.mark.parametrize("content", [b"a: [", b"- 1\n", b"\xff\xfe", b"3", None])
@@ -105,16 +108,3 @@ def test_a_key_that_is_there_twice_is_refused(tmp_path, content):
 def test_yaml_that_expands_is_refused(text, reason):
     with pytest.raises(ValueError, match=reason):
         parse_yaml(text)
-
-
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        ({"seed": "x"}, r"Outer: seed: [^\n]+ \(given: 'x'\)"),
-        ({"inner": {"reach_m": -1.0}}, r"Outer: inner\.reach_m: [^\n]+ \(given: -1\.0\)"),
-        ({"sed": 3}, "Outer: unknown key 'sed'; did you mean 'seed'\\?"),
-    ],
-)
-def test_a_wrong_value_in_python_is_one_line_too(content, reason):
-    with pytest.raises(InputError, match=rf"^{reason}$"):
-        Outer(**content)

@@ -1,16 +1,16 @@
-"""The pages of settings are what the settings say."""
+"""The pages of settings and commands are what the settings and the help of the commands say."""
 
 import pytest
 import yaml
 
 from fcslam.config import dump
 from fcslam.mission.mission import MissionConfig
-from tools import settings_reference
+from tools import reference_pages, settings_reference
+
+PAGES = {**settings_reference.PAGES, reference_pages.FOLDER / "commands.md": reference_pages.commands_page}
 
 
-@pytest.mark.parametrize(
-    ("path", "page"), settings_reference.PAGES.items(), ids=lambda value: getattr(value, "name", "")
-)
+@pytest.mark.parametrize(("path", "page"), PAGES.items(), ids=lambda value: getattr(value, "name", ""))
 def test_the_pages_are_up_to_date(path, page):
     assert path.read_text(encoding="utf-8") == page(), "run: make docs"
 

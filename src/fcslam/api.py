@@ -199,9 +199,10 @@ def changes(
     """
     from fcslam.mission.map_changes import changes_of, check_output, save_changes
 
+    opened, mission = open_run(run), read_mission(Path(run))
     if output is not None:
         check_output(Path(output), force)
-    found = changes_of(open_run(run), read_mission(Path(run)), since, until, map_index, str(Path(run)))
+    found = changes_of(opened, mission, since, until, map_index, str(Path(run)))
     if output is not None:
         save_changes(found, Path(output), force)
     return found

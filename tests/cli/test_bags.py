@@ -106,13 +106,3 @@ def test_only_force_replaces(tmp_path, bag, refused, name):
     assert open_source(output).survey().scan_count == 12
     assert run("record", output, "-o", output, "--force") == 0
     assert open_source(output).survey().scan_count == 12
-
-
-def test_what_convert_refuses(tmp_path, bag, refused):
-    (tmp_path / "thesis").mkdir()
-    (tmp_path / "thesis" / "main.tex").touch()
-    assert "not a recording" in refused("record", bag, "-o", tmp_path / "thesis", "--force")
-    assert (tmp_path / "thesis" / "main.tex").exists()
-    (tmp_path / "dir.bag").mkdir()
-    assert "is a folder" in refused("record", bag, "-o", tmp_path / "dir.bag", "--force")
-    assert "cannot be written" in refused("record", bag, "-o", bag / "a.mcap")

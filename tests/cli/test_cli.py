@@ -76,10 +76,3 @@ def test_a_closed_pipe_behind_stdout_is_silent():
     done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writing)
     assert (done.returncode, done.stderr) == (1, "")
-
-
-@pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
-def test_a_number_that_is_none_is_refused(tmp_path, refused, number):
-    line = refused("tools", "simulate", "-o", tmp_path / "s", f"--path-length={number}", "--robots", 1)
-    assert f"{number}: is not a finite number" in line
-    assert not (tmp_path / "s").exists()

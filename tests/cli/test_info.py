@@ -80,11 +80,6 @@ def test_names_of_a_bag_do_not_reach_the_terminal_as_they_are(tmp_path, capsys):
     assert "  /scan?[2J: sensor_msgs/LaserScan, 9 messages, 1.0 Hz, frame la?[31mser x" in out.splitlines()
 
 
-def test_json_has_no_calibration(bag, capsys):
-    assert main(["info", str(bag), "--json", "--calibrate"]) == 2
-    assert "--json has no calibration" in capsys.readouterr().err
-
-
 def test_json_holds_the_same(bag, capsys):
     assert main(["info", str(bag), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import yaml
 from rich.console import Console
 
 from fcslam.cli import live, main
@@ -96,29 +95,6 @@ def test_a_2d_recording_in_3d_is_told_what_its_laser_does(log, cloud, tmp_path, 
 def test_a_laser_that_is_localized_in_a_3d_map_joins_nothing(log, capsys):
     open_recording(str(log), None, notices(), in_3d=True)
     assert "joins" not in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        (["--credentials", "{token: two words}"], "holds no token"),
-        (["--credentials", "{client.pem: x}"], "client.pem and client.key belong together"),
-        (
-            ["--server", "https://localhost", "--credentials", "{client.pem: x, client.key: x}"],
-            "cannot read the certificate and its key",
-        ),
-        (["--credentials", "{ca.pem: x}"], "cannot read a certificate authority"),
-    ],
-)
-def test_what_is_wrong_is_one_line(log, cloud, tmp_path, refused, arguments, reason):
-    if arguments[-1].startswith("{"):  # a folder with these files
-        folder = tmp_path / "credentials"
-        folder.mkdir()
-        for name, content in yaml.safe_load(arguments[-1]).items():
-            (folder / name).write_text(content)
-        arguments = [*arguments[:-1], str(folder)]
-    assert reason in refused("play", log, "--server", cloud.url, "--state", tmp_path / "state", *arguments)
-    assert cloud.cloud.stored == {}
 
 
 def test_a_cloud_that_turns_the_robot_away_is_one_line(log, cloud, tmp_path, refused):

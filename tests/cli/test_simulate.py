@@ -51,20 +51,3 @@ def test_a_simulated_fleet_is_mapped(simulated, tmp_path):
     assert main(["map", *recordings, "--output", str(tmp_path / "run")]) == 0
     run = open_run(tmp_path / "run")
     assert [trajectory.robot for trajectory in run.trajectories.values()] == ["robot_1", "robot_2"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--robots", "0"], "0 is not in the range"),
-        (["--robots", "60"], "too small for 60 robots"),
-        (["--building", "castle"], "castle"),
-        (["--lighting", "dusk"], "dusk"),
-        (["--path-length", "0"], "0"),
-    ],
-)
-def test_what_cannot_be_is_refused(arguments, message, tmp_path, capsys):
-    assert main([*TINY, "--no-camera", *arguments, "--output", str(tmp_path / "fleet")]) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert "Traceback" not in said

@@ -46,6 +46,10 @@ WRONG = [
     ("record ros2:/r -o day.bag", "a recording of a live robot is a .mcap file", ""),
     ("record r.log -o a.zip", "fcslam: a.zip: not a kind of bag; end it in .bag", "record r.log -o a.bag"),
     ("record r.log -o r.bag", "r.bag: exists; choose another name or give --force", "record r.log -o r.bag --force"),
+    ("record r.log -o bags --force", "bags: is a folder, not a recording", ""),
+    ("record r.log -o dir.bag --force", "dir.bag: is a folder, not a recording", ""),
+    ("record r.log -o r.bag/a.mcap", "r.bag/a.mcap: cannot be written", ""),
+    ("info r.bag --json --calibrate", "--json has no calibration", "info r.bag --calibrate"),
     # Robots
     ("map r.log r.bag", "two recordings are called 'r'", "map r.log b=r.bag"),
     ("map r.bag copy=r.bag", "so they are copies", "map r.bag"),
@@ -138,6 +142,14 @@ WRONG = [
     ("play r.log --server http://127.0.0.1:http --state state", "is not the address of a cloud", PLAY),
     ("play r.log --server http://me:secret@{host} --state state", "has no user name and no password; remove all", PLAY),
     (f"{PLAY} --credentials nowhere", "holds no credentials (token, ca.pem, client.pem and client.key)", PLAY),
+    (f"{PLAY} --credentials words", "words/token: holds no token", PLAY),
+    (f"{PLAY} --credentials half", "client.pem and client.key belong together", PLAY),
+    (f"{PLAY} --credentials no_ca", "cannot read a certificate authority", PLAY),
+    (
+        "play r.log --state state --server https://localhost --credentials bad",
+        "cannot read the certificate and its",
+        "",
+    ),
     ("play r.log --server {url} --state notes.txt", "notes.txt: cannot be made (File exists); give another", PLAY),
     ("play r+1=r.log --server {url} --state state", "name it without '+1'", PLAY),
     ("serve --data run", "run: is a run, which `fcslam show run` shows; name a folder for missions", ""),
@@ -148,6 +160,19 @@ WRONG = [
     ("serve --data data --host 256.1.1.1 --insecure", "256.1.1.1", ""),
     ("serve --data data --port {port}", "choose another --port or --host", ""),
     ("show run --port {port}", "choose another --port or --host", ""),
+    # Simulation
+    *(
+        (f"tools simulate --building flat --no-camera {option} -o sim", says, "")
+        for option, says in (
+            ("--robots 0", "0 is not in the range"),
+            ("--robots 60", "too small for 60 robots"),
+            ("--building castle", "castle"),
+            ("--lighting dusk", "dusk"),
+            ("--path-length 0", "0.0 is not in the range"),
+            ("--path-length nan", "nan: is not a finite number"),
+            ("--path-length=-inf", "inf: is not a finite number"),
+        )
+    ),
     # Words
     ("mapp r.log", "No such command 'mapp'. Did you mean 'map'?", "map r.log"),
     ("help", "(`fcslam -h` shows what there is)", "-h"),
@@ -162,7 +187,7 @@ WRONG = [
 def artifacts(tmp_path_factory):
     """One of everything that users have."""
     place = tmp_path_factory.mktemp("artifacts")
-    for name in ("bags", "empty"):
+    for name in ("bags", "empty", "dir.bag"):
         (place / name).mkdir()
     carmen_text.save(place / "r.log", carmen_text.drive(40))
     said = bag_messages.drive(40)
@@ -176,6 +201,9 @@ def artifacts(tmp_path_factory):
     Run(stands).save(place / "two")
     (place / "relations").write_text("0 100 1.25 0 0 0 0 0\n0 999 0 0 0 0 0 0\n")
     (place / "notes.txt").write_text("hello\n")
+    for name in ("words/token", "half/client.pem", "no_ca/ca.pem", "bad/client.pem", "bad/client.key"):
+        (place / name).parent.mkdir(exist_ok=True)
+        (place / name).write_text("two words\n")
     (place / "empty.clf").touch()
     (place / "cut.clf.gz").write_bytes(gzip.compress("\n".join(carmen_text.drive(500)).encode())[:-200])
     for name in ("pic.png", "plan.png"):

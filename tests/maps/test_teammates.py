@@ -49,9 +49,14 @@ def drawn(keyscans, poses, config=CONFIG, senders=None):
     return fuse(keyscans, poses, dict.fromkeys(robots, (LASER,)), config, senders)
 
 
-def occupied_near(occupancy, ways, radius_m=RADIUS_M + 0.05):
+def occupied(occupancy):
+    """Centres of the occupied cells, shape (N, 2)."""
     rows, columns = np.nonzero(occupancy.cells == Occupancy.OCCUPIED)
-    cells = np.array(occupancy.origin_xy) + occupancy.resolution_m * (np.stack((columns, rows), axis=-1) + 0.5)
+    return np.array(occupancy.origin_xy) + occupancy.resolution_m * (np.stack((columns, rows), axis=-1) + 0.5)
+
+
+def occupied_near(occupancy, ways, radius_m=RADIUS_M + 0.05):
+    cells = occupied(occupancy)
     near = [np.hypot(*(cells - pose[:2]).T) <= radius_m for way in ways for pose in way]
     return int(np.any(near, axis=0).sum())
 
@@ -72,9 +77,11 @@ def test_robots_that_meet_leave_no_ghosts():
 
 def walls(occupancy):
     """Occupied cells along the walls of the room."""
-    rows, columns = np.nonzero(occupancy.cells == Occupancy.OCCUPIED)
-    cells = np.array(occupancy.origin_xy) + occupancy.resolution_m * (np.stack((columns, rows), axis=-1) + 0.5)
-    return {tuple(cell) for cell in np.round(cells, 3).tolist() if min(*cell, *(SIDE_M - np.array(cell))) < 0.06}
+    return {
+        tuple(cell)
+        for cell in np.round(occupied(occupancy), 3).tolist()
+        if min(*cell, *(SIDE_M - np.array(cell))) < 0.06
+    }
 
 
 def test_a_robot_that_says_it_is_at_the_walls_hides_none_of_them():

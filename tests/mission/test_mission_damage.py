@@ -120,25 +120,20 @@ def test_after_any_changed_byte_nothing_wrong_is_served(missions, tmp_path, kind
     assert refused > 30 or kind == "killed"
 
 
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.99])
-def test_a_cut_mission_is_refused(missions, tmp_path, share):
-    path, whole = closed(missions, tmp_path)
-    path.write_bytes(whole[: int(share * len(whole))])
-    assert_refused(path, "damaged or cut off .*; put its backup in its place")
+DAMAGE = {
+    **{f"cut at {share}": lambda whole, share=share: whole[: int(share * len(whole))] for share in (0.02, 0.5, 0.99)},
+    "lost tables": lambda whole: whole[:103] + bytes(2) + whole[105:],  # the number of rows in the schema's page
+    "a text that is not UTF-8": lambda whole: whole.replace(b"boss", b"b\xffss"),
+}
 
 
-def test_a_mission_that_lost_its_tables_is_not_a_new_one(missions, tmp_path):
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_a_damaged_mission_is_refused_and_stays_as_it_is(missions, tmp_path, kind):
     path, whole = closed(missions, tmp_path)
-    path.write_bytes(whole[:103] + bytes(2) + whole[105:])  # the number of rows in the schema's page
-    damaged = path.read_bytes()
+    damaged = DAMAGE[kind](whole)
+    path.write_bytes(damaged)
     assert_refused(path, "damaged or cut off .*; put its backup in its place")
     assert path.read_bytes() == damaged
-
-
-def test_a_text_that_cannot_be_decoded_is_damage(missions, tmp_path):
-    path, whole = closed(missions, tmp_path)
-    path.write_bytes(whole.replace(b"boss", b"b\xffss"))
-    assert_refused(path, "damaged or cut off .*; put its backup in its place")
 
 
 def test_what_is_damaged_while_it_is_open_gets_into_no_backup(missions, tmp_path):
