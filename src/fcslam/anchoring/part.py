@@ -29,7 +29,7 @@ class MapPart:
     graph: PoseGraph
 
     def at(self, poses: FloatArray) -> "MapPart":
-        """The same with other poses of the variables, shape (N, 3), metres and radians."""
+        """This part with other poses of the variables, shape (N, 3), metres and radians."""
         robots = tuple(replace(robot, T_map_base=frozen(poses[robot.variables])) for robot in self.robots)
         return MapPart(robots, PoseGraph.restored(poses, self.graph.given()))
 
@@ -80,7 +80,7 @@ class Positions:
     """Positions, outside of the map, of points that robots carry or see."""
 
     variables: NDArray[np.int64]
-    """Of the keyscans, shape (N,)."""
+    """Variables of the keyscans, shape (N,)."""
     arms: FloatArray
     """The points in the base of the keyscans, shape (N, 2)."""
     xy: FloatArray

@@ -88,8 +88,8 @@ class LiveSensors:
             if plan is None:
                 return
             self._reader = self._new_reader(plan)
-            read = (*plan.sensors.read_topics(with_images=True), plan.sensors.imu)
-            self._needed = {self._topics.fixes or "", *(each.name for each in read if each is not None)}
+            read = plan.sensors.read_topics(with_images=True, with_imu=True)
+            self._needed = {self._topics.fixes or "", *(each.name for each in read)}
             for message in self.planner.messages.released():
                 yield from self._read(message)
         reader = self._reader

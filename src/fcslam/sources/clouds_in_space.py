@@ -61,7 +61,7 @@ class CloudRecording(ABC):
 
     @abstractmethod
     def survey(self) -> Survey:
-        """As in Source; clouds are counted, and not decoded."""
+        """As in Source; clouds are counted, and only the first ones are decoded."""
 
     @abstractmethod
     def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:

@@ -29,7 +29,7 @@ FIRST_MESSAGES = 20
 
 
 def usual_beams(scans: Sequence[Beams]) -> Beams:
-    """Those of the first of the ``scans`` that agrees with most of them."""
+    """The beams of the first of the ``scans`` that agrees with most of them."""
     return max(scans, key=lambda declared: sum(misfit(beams, declared) is None for beams in scans))
 
 

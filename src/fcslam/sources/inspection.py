@@ -1,5 +1,6 @@
 """The contents of a recording of any format, and whether it can be mapped."""
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -102,22 +103,12 @@ def inspect(path: Path, options: BagOptions | None = None) -> Inspection:
 
 def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -> Inspection:
     survey = source.survey()
-    by_laser: list[tuple[LaserModel, list[float]]] = [] if is_whole(source) else [(each, []) for each in survey.lasers]
-    scans = odometry = images = 0
+    stamps: dict[LaserModel, list[float]] = {} if is_whole(source) else {laser: [] for laser in survey.lasers}
+    counts: Counter[type] = Counter()
     for record in source.records():
-        match record:
-            case LaserScan():
-                scans += 1
-                for laser, own in by_laser:
-                    if is_same_laser(record.laser, laser):
-                        own.append(record.stamp)
-                        break
-            case CloudScan():
-                scans += 1
-            case Odometry():
-                odometry += 1
-            case CameraImage():
-                images += 1
+        counts[type(record)] += 1
+        if isinstance(record, LaserScan):
+            stamps[next(laser for laser in stamps if is_same_laser(record.laser, laser))].append(record.stamp)
     of_bag = bag_of(source)
     origin = None if of_bag is None else of_bag.plan.odometry
     return Inspection(
@@ -125,14 +116,14 @@ def _inspected(source: Source, path: Path, name: str, bag: BagContents | None) -
         name,
         bag,
         source.name,
-        scans,
+        counts[LaserScan] + counts[CloudScan],
         survey.duration_s,
         survey.path_length_m,
-        tuple(LaserContents(laser, len(own), _rate_hz(own)) for laser, own in by_laser),
-        odometry,
+        tuple(LaserContents(laser, len(own), _rate_hz(own)) for laser, own in stamps.items()),
+        counts[Odometry],
         origin.name if origin else None,
         survey.camera,
-        images,
+        counts[CameraImage],
         str(source.faults) if source.faults else "",
         survey.notes,
     )

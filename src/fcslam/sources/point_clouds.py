@@ -40,7 +40,7 @@ GAP_M, GAP_PER_SPACING = 0.15, 3.0
 FLOOR_ERROR_M: Final = 0.3
 """The floor is at most this far from where the mounting says."""
 FLOOR_TILT_RAD: Final = radians(12.0)
-"""The same for its inclination."""
+"""The floor is inclined by at most this against the mounting."""
 LEANING_RAD: Final = radians(10.0)
 """A mounting from which the floor leans by more in most clouds is wrong."""
 LARGEST_LEANING_RAD: Final = radians(40.0)

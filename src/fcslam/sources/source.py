@@ -109,7 +109,7 @@ class Part(Derived):
         super().__init__(whole)
         self.name, self._first, self._count = name, first, count
         self._before = Faults({})
-        """Those of the scans before."""
+        """Faults of the scans before this part."""
 
     @property
     def faults(self) -> Faults:

@@ -155,7 +155,7 @@ class BagMessage(NamedTuple):
     """Counts the topic's messages from 1."""
     bag_time_ns: int
     unstamped_ns: int
-    """The stamp if it has none."""
+    """Stamp of a message whose header has none."""
     decoded: Any
     """Laser scans, odometry and tf as in ``Content``; other types as objects of rosbags. An error if invalid."""
 
@@ -167,7 +167,7 @@ class BagMessage(NamedTuple):
         return self.decoded
 
     def by_clock(self, lag_ns: int) -> "BagMessage":
-        """The same, read by a clock of the topic that is so far behind that of recording, if it has no stamp."""
+        """The message with a stamp by the topic's clock, ``lag_ns`` behind that of recording, if it has none."""
         if not lag_ns:
             return self
         is_converted = self.topic.type in _KEPT

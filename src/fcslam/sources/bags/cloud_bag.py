@@ -14,7 +14,7 @@ from fcslam.sources.bags.reader import CloudStream
 from fcslam.sources.bags.robots import slashed
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.clouds_in_space import BAND_LASER, CloudReader, CloudRecording
-from fcslam.sources.faults import Audit, Fault
+from fcslam.sources.faults import Audit
 from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.source import Source, Survey
 
@@ -39,8 +39,8 @@ class CloudBag(CloudRecording):
     def inputs(self) -> tuple[str, ...]:
         """Lines that say what is read, and what is wrong with the clouds."""
         plan, (reader, notes) = self._plan, self._reader
-        topics = (*plan.read_topics(with_images=False), *filter(None, (plan.imu,)))
-        return f"--3d reads {', '.join(topic.name for topic in topics)}{', with times' * reader.is_timed}", *notes
+        topics = ", ".join(topic.name for topic in plan.read_topics(with_imu=True))
+        return f"--3d reads {topics}{', with times' * reader.is_timed}", *notes
 
     def survey(self) -> Survey:
         """As in ``CloudRecording``."""
@@ -58,14 +58,8 @@ class CloudBag(CloudRecording):
     def _scans(self, audit: Audit) -> Iterator[tuple[int, CloudScan]]:
         plan, (reader, _) = self._plan, self._reader
         stream = CloudStream(reader, audit)
-        for message in self._bag.bag.read([*plan.read_topics(with_images=False), *filter(None, (plan.imu,))]):
-            try:
-                items = plan.items(message)
-            except ValueError:
-                audit.add(Fault.BROKEN_MESSAGE, message.number)
-                continue
-            for item in items:
-                yield from stream.add(message.number, item)
+        for number, item in plan.read(self._bag.bag.read(plan.read_topics(with_imu=True)), audit, {}):
+            yield from stream.add(number, item)
         yield from stream.finish()
 
 

@@ -77,7 +77,7 @@ class OdometryPairing:
 
     def __init__(self) -> None:
         self._readings: list[OdometryReading] = []
-        """Those of the present clock, in the order of their stamps."""
+        """Readings of the present clock, in the order of their stamps."""
         self._queue: deque[_QueuedItem] = deque()
         self._updates = OdometryUpdates()
 

@@ -1,6 +1,6 @@
 """Decides once, before the messages of a robot are read, which of its topics and frames are read, and how."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, islice, pairwise
 from math import degrees, dist, inf, radians, tau
@@ -26,7 +26,7 @@ from fcslam.sources.bags.robots import BagRobot, listed, usual
 from fcslam.sources.bags.topics import KnownTopics, Topics, choose_topics
 from fcslam.sources.bags.transforms import Link, Mounting, NoTransformError, TransformTree, is_corrected
 from fcslam.sources.contradictions import CHANGED, changed_share
-from fcslam.sources.faults import Audit
+from fcslam.sources.faults import Audit, Fault
 from fcslam.sources.gate import FIRST_MESSAGES, MAX_STEP_BACK_S
 from fcslam.sources.motion import LARGEST_SPEED
 from fcslam.sources.path_summary import fault_of_odometry, without_odometry
@@ -76,7 +76,7 @@ class BagPlan(NamedTuple):
     odometry_ahead_s: float
     """The clock of the odometry against that of the scans."""
     frames: Link
-    """Those of the odometry: parent and child, the base; usual ones where nothing names them."""
+    """Frames of the odometry, parent and child (the base); usual ones where no message names them."""
     fixes: Topic | None
     fixes_ahead_s: float
     imu: Topic | None
@@ -93,11 +93,27 @@ class BagPlan(NamedTuple):
         first = self.lasers[0].first
         return first.sweep if first.ranges_at_stamp is None else None
 
-    def read_topics(self, with_images: bool) -> list[Topic]:
-        """The topics of a pass over the messages, but that of an IMU."""
-        camera = (self.topics.camera,) if with_images and self.topics.camera is not None else ()
+    def read_topics(self, with_images: bool = False, with_imu: bool = False) -> list[Topic]:
+        """The topics of a pass over the messages."""
+        others = self.topics.camera if with_images else None, self.imu if with_imu else None
         odometry = () if self.odometry is None else self.odometry.topics
-        return list(dict.fromkeys((*odometry, *self.topics.scans, *camera)))
+        return list(dict.fromkeys((*odometry, *self.topics.scans, *filter(None, others))))
+
+    def read(self, messages: Iterable[BagMessage], audit: Audit, errors: dict[str, str]) -> Iterator[tuple[int, Item]]:
+        """What is read of messages, with their numbers.
+
+        ``audit`` counts those that are invalid, and ``errors`` gets the first of each topic.
+        """
+        for message in messages:
+            try:
+                items = self.items(message)
+            except ValueError as error:
+                errors.setdefault(message.topic.name, f"message {message.number} of it: {error}")
+                is_image = message.topic == self.topics.camera
+                audit.add(Fault.BROKEN_IMAGE if is_image else Fault.BROKEN_MESSAGE, message.number)
+                continue
+            for item in items:
+                yield message.number, item
 
     def items(self, message: BagMessage) -> list[Item]:
         """What is read of a message; raises ValueError if it is invalid."""

@@ -156,16 +156,8 @@ class RosBag:
     ) -> Iterator[Numbered]:
         plan = self.plan
         reader = SensorReader(plan.lasers, plan.odometry is not None, audit, imu)
-        for message in self.bag.read(plan.read_topics(with_images)):
-            try:
-                items = plan.items(message)
-            except ValueError as error:
-                errors.setdefault(message.topic.name, f"message {message.number} of it: {error}")
-                is_image = message.topic == plan.topics.camera
-                audit.add(Fault.BROKEN_IMAGE if is_image else Fault.BROKEN_MESSAGE, message.number)
-                continue
-            for item in items:
-                yield from reader.add(message.number, item)
+        for number, item in plan.read(self.bag.read(plan.read_topics(with_images)), audit, errors):
+            yield from reader.add(number, item)
         yield from reader.finish()
 
     @cached_property
@@ -203,7 +195,7 @@ class RosBag:
                 f"{self.path}: {its.unstamped} of {its.count} messages of {topic.name} have no stamp; their "
                 "times of recording count"
                 for topic, its in self.bag.census.items()
-                if topic in plan.read_topics(with_images=False) and not is_transforms(topic) and its.unstamped > 1
+                if topic in plan.read_topics() and not is_transforms(topic) and its.unstamped > 1
             ),
             *chain.from_iterable(laser.notes(self.path, self.options.cloud_band) for laser in lasers),
             *plan.scans.notes,

@@ -47,7 +47,7 @@ class KnownTopics(NamedTuple):
 
     @property
     def heard(self) -> list[Topic]:
-        """Those of the robot that have messages."""
+        """The robot's topics that have messages."""
         return [topic for topic in self.own if topic.message_count]
 
 
