@@ -144,7 +144,7 @@ def turns(pace: float) -> Iterator:
         measured = codec.vector("Vector3", z=rate + 0.02 + float(rng.normal(0.0, 0.005)))
         header = codec.header(round((START + t) * 1e9), "base_link")
         payload = codec.encode(codec.make(IMU, header=header, angular_velocity=measured), IMU)
-        yield Said("/imu", "sensor_msgs/msg/Imu", START + t, {"payload": payload})
+        yield Said("/imu", IMU, START + t, {"payload": payload})
 
 
 def row(kind: str, name: str, messages: Iterable) -> tuple:

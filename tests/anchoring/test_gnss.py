@@ -12,19 +12,18 @@ from fcslam.geometry import se2
 from fcslam.graph.pose_graph import Edge, PoseGraph
 from fcslam.records import GnssFix, Keyscan, KeyscanFix, KeyscanId, LaserModel, LaserScan, frozen
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.sources.bags.codec import FIX
 from fcslam.sources.bags.rosbag import RosBag
 from fcslam.sources.bags.writer import write_bag
 from fcslam.sources.faults import Fault
 from tests.anchoring.test_plan import placed
 from tests.planned_building import LASER, WALLS, mapped, ranges_at, sides, true_poses
-from tests.sources.bag_messages import ROS2, Said, drive, save
-from tests.sources.clouds import header
+from tests.sources.bag_messages import CODECS, Said, drive, header, save
 
 pytestmark = pytest.mark.slow
 
 pyproj = pytest.importorskip("pyproj")
 
-FIX = "sensor_msgs/msg/NavSatFix"
 ORIGIN = (47.3769, 8.5417, 400.0)
 ANTENNA = (-0.3, 0.2)
 SIGMA_M = 0.3
@@ -167,20 +166,17 @@ def test_a_bag_gives_its_fixes_and_names_those_at_zero(tmp_path, suffix):
 
 
 def fix_message(stamp, status, latitude=47.0):
-    make = ROS2.types
-    return make[FIX](
-        header=header(ROS2, stamp, "gps"), status=make["sensor_msgs/msg/NavSatStatus"](status=status, service=1),
-        latitude=latitude, longitude=8.5, altitude=400.0, position_covariance=np.zeros(9), position_covariance_type=0,
-    )  # fmt: skip
+    codec = CODECS[False]
+    named = {"header": header(stamp, "gps"), "status": codec.make("sensor_msgs/NavSatStatus", status=status)}
+    return codec.encode(codec.make(FIX, **named, latitude=latitude, longitude=8.5), FIX)
 
 
 def test_fixes_of_each_status_are_used_or_counted_by_the_clock_of_the_scans(tmp_path):
     messages = drive(200)
     for k, status in enumerate((0, -1, -2, -2) * 9):
         at, ahead = 100.0 + k, fix_message(118.0 + k, status)
-        messages.append(Said("/fix", FIX, at, {"payload": ROS2.serialize_cdr(ahead, FIX)}))
-    exchanged = ROS2.serialize_cdr(fix_message(154.0, 0, 121.0), FIX)
-    messages.append(Said("/fix", FIX, 136.0, {"payload": exchanged}))
+        messages.append(Said("/fix", FIX, at, {"payload": ahead}))
+    messages.append(Said("/fix", FIX, 136.0, {"payload": fix_message(154.0, 0, 121.0)}))
     bag = RosBag(save(tmp_path / "run.mcap", messages), "run")
     found = [record.stamp for record in bag.records() if isinstance(record, GnssFix)]
     assert found == pytest.approx([100.0 + k for k in range(36) if k % 4 != 1], abs=0.1)

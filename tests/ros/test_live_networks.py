@@ -22,7 +22,6 @@ from fcslam.sources import write_bag
 from tests import small_fleet
 from tests.postgres import free_port
 from tests.robot import spinning
-from tests.ros.played import for_player
 
 ROOT = Path(__file__).parents[2]
 RCLPY = Path(os.environ.get("FCSLAM_RCLPY", ROOT / ".venv-ros" / "bin" / "python"))
@@ -47,15 +46,9 @@ def folder(scans, tmp_path_factory):
     return mapped(scans, tmp_path_factory.mktemp("live"))
 
 
-@pytest.fixture(scope="module")
 def spinning_scans():
     scans = spinning.drive(15.0, odometry=lambda stamp: spinning.pose_at(stamp) * (1.03, 1.03, 0.97))
     return [replace(scan, stamp=scan.stamp + 100.0) for scan in scans]  # ROS takes 0 for no stamp
-
-
-@pytest.fixture(scope="module")
-def spinning_folder(spinning_scans, tmp_path_factory):
-    return mapped(spinning_scans, tmp_path_factory.mktemp("spinning"))
 
 
 def mapped(scans, folder):
@@ -64,6 +57,19 @@ def mapped(scans, folder):
     write_bag(folder / "bag.mcap", scans)
     ended(fcslam("map", f"robot1={folder / 'bag.mcap'}", "-o", folder / "expected", "-q"))
     return folder
+
+
+def for_player(path, scans):
+    """Write a robot's scans for ``rclpy_player.py``."""
+    laser, sweep = scans[0].laser, scans[0].sweep
+    np.savez(
+        path,
+        stamps=[scan.stamp for scan in scans],
+        ranges=[scan.ranges_m for scan in scans],
+        odometry=[scan.T_odom_base for scan in scans],
+        laser=[laser.angle_min_rad, laser.angle_increment_rad, laser.max_range_m],
+        beam_s=0.0 if sweep is None else sweep.duration_s / (laser.beam_count - 1),
+    )
 
 
 def fcslam(*arguments, cwd=None, **environment):
@@ -87,9 +93,9 @@ def ended(process, *others):
     return out + error
 
 
-def play(python, script, folder, namespace="/robot1", **environment):
+def play(folder, namespace="/robot1", **environment):
     """The drive as its player saw it."""
-    command = [python, HERE / script, folder / "scans.npz", namespace, str(SPEED)]
+    command = [RCLPY, HERE / "rclpy_player.py", folder / "scans.npz", namespace, SPEED]
     done = subprocess.run(
         list(map(str, command)), env={**os.environ, **environment}, capture_output=True, text=True, timeout=LONGEST_S,
         check=False,
@@ -126,12 +132,14 @@ def check_drive(played, scans, output, folder):
 
 
 @needs_rclpy
-@pytest.mark.parametrize(("prefix", "domain"), [("", 41), ("spinning_", 45)], ids=["at once", "spinning"])
-def test_a_robot_of_ros_2(request, prefix, domain, tmp_path):
-    folder, scans = request.getfixturevalue(f"{prefix}folder"), request.getfixturevalue(f"{prefix}scans")
-    environment = ros2(domain)
+@pytest.mark.parametrize("is_spinning", [False, True])
+def test_a_robot_of_ros_2(is_spinning, scans, folder, tmp_path):
+    if is_spinning:
+        scans = spinning_scans()
+        folder = mapped(scans, tmp_path)
+    environment = ros2(45 if is_spinning else 41)
     robot = fcslam("robot", "ros2:/robot1", mounting(scans), "-o", tmp_path / "run", **environment)
-    played = play(RCLPY, "rclpy_player.py", folder, **environment)
+    played = play(folder, **environment)
     ended(robot)
     check_drive(played, scans, tmp_path / "run", folder)
 
@@ -140,7 +148,7 @@ def test_a_robot_of_ros_2(request, prefix, domain, tmp_path):
 def test_a_recording_of_ros_2(folder, scans, tmp_path):
     environment = ros2(42)
     recorder = fcslam("record", "ros2:/robot1", "-o", tmp_path / "robot1.mcap", **environment)
-    play(RCLPY, "rclpy_player.py", folder, **environment)
+    play(folder, **environment)
     recorder.send_signal(signal.SIGINT)
     assert f"{len(scans)} of /robot1/scan" in ended(recorder)
     ended(fcslam("map", tmp_path / "robot1.mcap", mounting(scans), "-o", tmp_path / "run", "-q"))
@@ -176,7 +184,7 @@ def test_three_robots_of_ros_2_share_one_map(drawn, tmp_path, port):
         for_player(folder / "scans.npz", scans)
         words = ["robot", f"ros2:/{robot.name}", mounting(scans), "-o", folder / "run", "--state", folder / "state"]
         robots.append(fcslam(*words, "--server", f"http://127.0.0.1:{port}", **environment))
-        players.append((RCLPY, "rclpy_player.py", folder, f"/{robot.name}"))
+        players.append((folder, f"/{robot.name}"))
     try:
         with ThreadPoolExecutor() as pool:
             drives = list(pool.map(lambda player: play(*player, **environment), players))

@@ -31,8 +31,11 @@ def messages_of(scans, ranges, **laser):
         yield "/scan", SCAN, scan(stamp, ranges, **laser)
 
 
-def recorded(output, messages):
-    """Record these messages; returns what is said, and the counts of each topic or the error."""
+def recorded(output, messages, stop_after=None):
+    """Record these messages; returns what is said, and the counts of each topic or the error.
+
+    With ``stop_after`` messages, the recording is stopped, and they keep coming.
+    """
     network = MemoryNetwork(TOPICS)
     topics = await_sensors(network, "", BagOptions(), 0.0, 0.0)
     stop, said = threading.Event(), []
@@ -47,8 +50,12 @@ def recorded(output, messages):
     thread.start()
     while "/clock" not in network.subscribed:
         stop.wait(0.01)
-    for topic, kind, message in messages:
+    for number, (topic, kind, message) in enumerate(messages):
         network.say(topic, kind, message)
+        if number == stop_after:
+            stop.set()
+        if not thread.is_alive():
+            break
     stop.set()
     thread.join(120.0)
     return said
@@ -114,21 +121,5 @@ def test_a_missing_middleware_is_told_with_the_command_that_installs_it(monkeypa
 
 
 def test_a_recording_ends_although_messages_keep_coming(tmp_path):
-    network, stop = MemoryNetwork(TOPICS), threading.Event()
-    topics = await_sensors(network, "", BagOptions(), 0.0, 0.0)
-    counts = []
-    thread = threading.Thread(
-        target=lambda: counts.append(record(network, topics, tmp_path / "day.mcap", stop, print)), daemon=True
-    )
-    thread.start()
-    while "/clock" not in network.subscribed:
-        stop.wait(0.01)
-    messages = messages_of(100_000, RANGES)
-    for number, (topic, kind, message) in enumerate(messages):
-        network.say(topic, kind, message)
-        if number == 50:
-            stop.set()
-        if not thread.is_alive():
-            break
-    thread.join(120.0)
-    assert 50 < sum(counts[0].values()) < 200_001
+    (counts,) = recorded(tmp_path / "day.mcap", messages_of(100_000, RANGES), stop_after=50)
+    assert 50 < sum(counts.values()) < 200_001

@@ -1,4 +1,4 @@
-"""Bags made by hand with rosbags, so that the reader is not tested against the project's own writer."""
+"""Bags written by rosbags, so that the reader is not tested against the project's own writer."""
 
 import math
 import shutil
@@ -9,24 +9,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 
-SCAN, ODOM, TF, TEXT = (
-    f"{package}/msg/{name}"
-    for package, name in (
-        ("sensor_msgs", "LaserScan"),
-        ("nav_msgs", "Odometry"),
-        ("tf2_msgs", "TFMessage"),
-        ("std_msgs", "String"),
-    )
-)
+from fcslam.sources.bags.codec import ODOMETRY as ODOM
+from fcslam.sources.bags.codec import SCAN, MessageCodec, full_name
+from fcslam.sources.bags.codec import TRANSFORMS as TF
+
+TEXT = "std_msgs/String"
 BEAMS = 8
 ANGLE_MIN, INCREMENT = -math.pi / 2, math.pi / 8
 LASER_POSE = (0.2, 0.05, 0.1)
 
-ROS1 = get_typestore(Stores.ROS1_NOETIC)
-ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
-ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+CODECS = {is_ros1: MessageCodec(is_ros1) for is_ros1 in (False, True)}
+STORES = {False: get_typestore(Stores.ROS2_HUMBLE), True: CODECS[True].store}
+"""Definitions of messages, by whether they are those of ROS 1."""
 
 
 class Said(NamedTuple):
@@ -121,7 +117,7 @@ def save(path: Path, said: Iterable[Said], compression: str = "", chunk_bytes: i
         if chunk_bytes is not None:
             writer.chunk_threshold = chunk_bytes
         with writer:
-            _write(writer, messages, ROS1)
+            _write(writer, messages, is_ros1=True)
         return path
     sqlite = path.suffix == ".db3"
     plugin = rosbag2.StoragePlugin.SQLITE3 if sqlite else rosbag2.StoragePlugin.MCAP
@@ -130,7 +126,7 @@ def save(path: Path, said: Iterable[Said], compression: str = "", chunk_bytes: i
     if compression:
         writer.set_compression(rosbag2.CompressionMode[compression.upper()], rosbag2.CompressionFormat.ZSTD)
     with writer:
-        _write(writer, messages, ROS2, chunk_bytes)
+        _write(writer, messages, chunk_bytes=chunk_bytes)
     if not path.suffix:
         return path
     (folder / path.name).rename(path)
@@ -161,59 +157,45 @@ HEADER = (0x01, counted("<I", b"ros2") + counted("<I", b"test"))
 END = [(0x0F, bytes(4)), (0x02, bytes(20))]
 
 
-def _write(writer, messages, store, chunk_bytes=None):
+def _write(writer, messages, is_ros1=False, chunk_bytes=None):
     connections = {}
-    for topic, kind, bag_time, fields in messages:
-        if (topic, kind) not in connections:
-            connections[topic, kind] = writer.add_connection(topic, kind, typestore=store)
-        payload = payload_of(Said(topic, kind, bag_time, fields), store is ROS1)
-        writer.write(connections[topic, kind], round(bag_time * 1e9), payload)
+    for message in messages:
+        named = message.topic, message.kind
+        if named not in connections:
+            connections[named] = writer.add_connection(named[0], full_name(named[1]), typestore=STORES[is_ros1])
+        writer.write(connections[named], round(message.bag_time * 1e9), payload_of(message, is_ros1))
         if chunk_bytes is not None and writer.storage.chunk.bio.tell() > chunk_bytes:
             writer.storage.close_chunk()
 
 
-def payload_of(message, is_ros1):
+def payload_of(message, is_ros1=False):
     """The bytes of a message."""
-    store, serialize = (ROS1, ROS1.serialize_ros1) if is_ros1 else (ROS2, ROS2.serialize_cdr)
     payload = message.fields.get("payload")
-    return serialize(_message(store, message.kind, message.fields), message.kind) if payload is None else payload
+    return CODECS[is_ros1].encode(message_of(message, is_ros1), message.kind) if payload is None else payload
 
 
-def _message(store, kind, fields):
-    def make(name, *values, **named):
-        return store.types[name.replace("/", "/msg/")](*values, **named)
-
-    def header(frame):
-        ns = round(fields["stamp"] * 1e9)
-        stamp = make("builtin_interfaces/Time", ns // 10**9, ns % 10**9)
-        return make("std_msgs/Header", **({"seq": 0} if store is ROS1 else {}), stamp=stamp, frame_id=frame)
-
+def message_of(message, is_ros1=False):
+    """A message as an object of rosbags."""
+    kind, fields, codec = message.kind, message.fields, CODECS[is_ros1]
+    make, vector = codec.make, codec.vector
     if kind == TEXT:
-        return make("std_msgs/String", "hello")
+        return make(TEXT, data="hello")
+    at = header(fields["stamp"], fields["frame" if kind == SCAN else "parent"], is_ros1)
     if kind == SCAN:
         ranges = np.array(fields["ranges"], dtype=np.float32)
-        names = ("angle_min", "angle_increment", "range_min", "range_max")
-        return make(
-            "sensor_msgs/LaserScan",
-            header=header(fields["frame"]),
-            **{name: fields[name] for name in names},
-            angle_max=fields.get("angle_max", fields["angle_min"] + (len(ranges) - 1) * fields["angle_increment"]),
-            time_increment=fields.get("time_increment", 0.0),
-            scan_time=0.0,
-            ranges=ranges,
-            intensities=np.zeros(0, np.float32),
-        )
-    rotation = make("geometry_msgs/Quaternion", *fields["rotation"])
+        angle_max = fields["angle_min"] + (len(ranges) - 1) * fields["angle_increment"]
+        names = {"angle_min", "angle_max", "angle_increment", "time_increment", "range_min", "range_max"}
+        stated = {name: value for name, value in fields.items() if name in names}
+        return make(SCAN, header=at, ranges=ranges, **{"angle_max": angle_max, **stated})
+    rotation = make("geometry_msgs/Quaternion", **dict(zip("xyzw", fields["rotation"], strict=True)))
     if kind == TF:
-        transform = make("geometry_msgs/Transform", make("geometry_msgs/Vector3", *fields["at"]), rotation)
-        stamped = make("geometry_msgs/TransformStamped", header(fields["parent"]), fields["child"], transform)
-        return make("tf2_msgs/TFMessage", [stamped])
-    pose = make("geometry_msgs/Pose", make("geometry_msgs/Point", *fields["at"]), rotation)
-    still = make("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
-    return make(
-        "nav_msgs/Odometry",
-        header=header(fields["parent"]),
-        child_frame_id=fields["child"],
-        pose=make("geometry_msgs/PoseWithCovariance", pose, np.zeros(36)),
-        twist=make("geometry_msgs/TwistWithCovariance", make("geometry_msgs/Twist", still, still), np.zeros(36)),
-    )
+        transform = make("geometry_msgs/Transform", translation=vector("Vector3", *fields["at"]), rotation=rotation)
+        named = {"header": at, "child_frame_id": fields["child"]}
+        return make(TF, transforms=[make("geometry_msgs/TransformStamped", **named, transform=transform)])
+    pose = make("geometry_msgs/Pose", position=vector("Point", *fields["at"]), orientation=rotation)
+    posed = make("geometry_msgs/PoseWithCovariance", pose=pose)
+    return make(ODOM, header=at, child_frame_id=fields["child"], pose=posed)
+
+
+def header(stamp, frame, is_ros1=False):
+    return CODECS[is_ros1].header(round(stamp * 1e9), frame)

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE, POINT_CLOUD
 from tests import spinning_lidar
-from tests.sources.bag_messages import ROS1, ROS2, Said
+from tests.sources.bag_messages import CODECS, Said, header
 
-CLOUD, IMAGE, INFO = (f"sensor_msgs/msg/{name}" for name in ("PointCloud2", "Image", "CameraInfo"))
 ROOM = np.array([[-3.0, -2.0, 0.0], [5.0, 4.0, 2.5]])
 """Lowest and highest corner."""
 BOXES = np.array(
@@ -104,22 +104,20 @@ def cloud(stamp, measured, layout, frame="lidar", height=1, ros1=False, **change
     values = np.zeros(len(measured.points), dtype)
     for name, _, _, value in fields:
         values[name] = value(measured)
-    store = ROS1 if ros1 else ROS2
-    make = store.types
+    make = CODECS[ros1].make
     named = {
+        "header": header(stamp, frame, ros1),
         "height": height,
         "width": len(values) // height,
         "fields": [
-            make["sensor_msgs/msg/PointField"](name=name, offset=offset, datatype=NUMBERS[kind], count=1)
+            make("sensor_msgs/PointField", name=name, offset=offset, datatype=NUMBERS[kind], count=1)
             for name, kind, offset, _ in fields
         ],
-        "is_bigendian": False,
         "point_step": step,
         "row_step": step * (len(values) // height),
         "data": values.view(np.uint8).reshape(-1),
-        "is_dense": True,
     }
-    return make[CLOUD](header=header(store, stamp, frame), **{**named, **changes})
+    return make(POINT_CLOUD, **{**named, **changes})
 
 
 def xyz(kind="f4"):
@@ -130,9 +128,8 @@ def xyz(kind="f4"):
     ]
 
 
-def said(topic, stamp, message, kind=CLOUD, ros1=False):
-    serialize = ROS1.serialize_ros1 if ros1 else ROS2.serialize_cdr
-    return Said(topic, kind, stamp + PERIOD_S, {"payload": bytes(serialize(message, kind))})
+def said(topic, stamp, message, kind=POINT_CLOUD, ros1=False):
+    return Said(topic, kind, stamp + PERIOD_S, {"payload": CODECS[ros1].encode(message, kind)})
 
 
 def depth_image(stamp, encoding, pitch=0.0, height_m=0.3, width=160, height=120, fx=95.0):
@@ -143,25 +140,11 @@ def depth_image(stamp, encoding, pitch=0.0, height_m=0.3, width=160, height=120,
     directions = rays / lengths[:, None] @ (rotation(pitch=pitch) @ OPTICAL).T
     depth = cast(np.tile([0.0, 0.0, height_m], (len(rays), 1)), directions) / lengths
     pixels = (depth * 1000.0).round().astype("<u2") if encoding == "16UC1" else depth.astype("<f4")
-    make, at = ROS2.types, header(ROS2, stamp, "depth_optical_frame")
-    image = make[IMAGE](
-        header=at, height=height, width=width, encoding=encoding, is_bigendian=0, step=width * pixels.itemsize,
-        data=pixels.view(np.uint8).reshape(-1),
-    )  # fmt: skip
-    K = np.array([fx, 0, width / 2, 0, fx, height / 2, 0, 0, 1.0])
-    info = make[INFO](
-        header=at, height=height, width=width, distortion_model="plumb_bob", d=np.zeros(5), k=K,
-        r=np.eye(3).ravel(), p=np.insert(K, (3, 6, 9), 0.0), binning_x=0, binning_y=0,
-        roi=make["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False),
-    )  # fmt: skip
-    return image, info
-
-
-def header(store, stamp, frame):
-    seconds, nanoseconds = divmod(round(stamp * 1e9), 10**9)
-    time = store.types["builtin_interfaces/msg/Time"](seconds, nanoseconds)
-    count = {"seq": 0} if store is ROS1 else {}
-    return store.types["std_msgs/msg/Header"](**count, stamp=time, frame_id=frame)
+    make, size = CODECS[False].make, {"width": width, "height": height}
+    size["header"] = header(stamp, "depth_optical_frame")
+    data = pixels.view(np.uint8).reshape(-1)
+    image = make(IMAGE, **size, encoding=encoding, step=width * pixels.itemsize, data=data)
+    return image, make(CAMERA_INFO, **size, k=np.array([fx, 0, width / 2, 0, fx, height / 2, 0, 0, 1.0]))
 
 
 def _none(_measured):

@@ -1,20 +1,23 @@
 """Cameras in bags: what is written reads back, what others write is read, and what is missing turns the camera off."""
 
+from itertools import count
+
 import cv2
 import numpy as np
 import pytest
 from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 
 from fcslam.errors import SourceError
 from fcslam.records import CameraImage, LaserScan
 from fcslam.sources import BagOptions, Fault, open_source, write_bag
+from fcslam.sources.bags.codec import IMAGE, full_name
+from tests.sources.bag_messages import CODECS, STORES
 from tests.sources.camera_records import CAMERA, drive, image, png, same
 
 pytestmark = pytest.mark.slow
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
+STORE = STORES[False]
 KINDS = ["run.bag", "run.mcap", "run.db3", "run"]
 PIXELS = np.arange(CAMERA.height * CAMERA.width * 3, dtype=np.uint8).reshape(CAMERA.height, CAMERA.width, 3)
 
@@ -54,10 +57,6 @@ def test_others_read_the_camera(tmp_path):
     assert (rotation.x, rotation.y, rotation.z, rotation.w) == CAMERA.T_base_camera.rotation
 
 
-def make(kind, **fields):
-    return STORE.types[kind.replace("/", "/msg/")](**fields)
-
-
 def rewritten(tmp_path, change):
     """The bag of a drive with each message as ``change(topic, type, message)`` has it: the same three, or None."""
     write_bag(tmp_path / "before.mcap", drive(5))
@@ -85,11 +84,9 @@ def as_raw(encoding, pixels, padding=0):
             return topic, kind, message
         rows = pixels.reshape(CAMERA.height, -1)
         padded = np.hstack([rows, np.full((CAMERA.height, padding), 255, np.uint8)])
-        raw = make(
-            "sensor_msgs/Image", header=message.header, height=CAMERA.height, width=CAMERA.width, encoding=encoding,
-            is_bigendian=0, step=padded.shape[1], data=padded.ravel(),
-        )  # fmt: skip
-        return "/camera/image_raw", "sensor_msgs/msg/Image", raw
+        size = {"height": CAMERA.height, "width": CAMERA.width, "step": padded.shape[1]}
+        raw = CODECS[False].make(IMAGE, header=message.header, **size, encoding=encoding, data=padded.ravel())
+        return "/camera/image_raw", full_name(IMAGE), raw
 
     return change
 
@@ -115,16 +112,15 @@ def without(*lost):
     return lambda topic, kind, message: None if topic in lost else (topic, kind, message)
 
 
-def distorted(topic, kind, message):
-    if topic == "/camera/camera_info":
-        message.d = np.full(5, 0.1)
-    return topic, kind, message
+def calibrated(field, value):
+    """A change of a field of the calibration."""
 
+    def change(topic, kind, message):
+        if topic == "/camera/camera_info":
+            setattr(message, field, value)
+        return topic, kind, message
 
-def uncalibrated(topic, kind, message):
-    if topic == "/camera/camera_info":
-        message.k = np.zeros(9)
-    return topic, kind, message
+    return change
 
 
 def unmounted(topic, kind, message):
@@ -137,7 +133,7 @@ def unmounted(topic, kind, message):
     ("change", "words"),
     [
         (without("/camera/camera_info"), "no calibration"),
-        (uncalibrated, "never calibrated"),
+        (calibrated("k", np.zeros(9)), "never calibrated"),
         (unmounted, "no transform from 'base_link' to 'camera_optical_frame'"),
     ],
 )
@@ -153,19 +149,19 @@ def test_without_all_of_it_the_camera_is_left_out_and_the_laser_goes_on(tmp_path
 
 
 def test_distortion_is_said(tmp_path):
-    source = open_source(rewritten(tmp_path, distorted))
+    source = open_source(rewritten(tmp_path, calibrated("d", np.full(5, 0.1))))
     assert "distorted" in source.survey().notes[0]
     assert len(images(source)) == 5
 
 
 def test_an_image_that_is_none_is_left_out_and_counted(tmp_path):
-    count, jpeg = iter(range(10)), bytearray(cv2.imencode(".jpg", np.zeros((6, 8), np.uint8))[1])
+    number, jpeg = count(), bytearray(cv2.imencode(".jpg", np.zeros((6, 8), np.uint8))[1])
     size = jpeg.index(b"\xff\xc0") + 5
     jpeg[size : size + 4] = b"\xff\xff\xff\xff"  # 65535 x 65535 pixels
 
     def change(topic, kind, message):
         if topic == "/camera/image_raw/compressed":
-            message.data = np.frombuffer({2: b"no image", 3: png(9, 6), 4: jpeg}.get(next(count), png()), np.uint8)
+            message.data = np.frombuffer({2: b"no image", 3: png(9, 6), 4: jpeg}.get(next(number), png()), np.uint8)
         return topic, kind, message
 
     source = open_source(rewritten(tmp_path, change))
@@ -174,18 +170,15 @@ def test_an_image_that_is_none_is_left_out_and_counted(tmp_path):
     assert source.survey().scan_count == 5
 
 
-def doubled(topic, kind, message):
-    """The other camera, which is heard less often, is the only one that stays under its old name."""
-    if topic == "/camera/image_raw/compressed" and doubled.count % 2:
-        topic = "/rear/image_raw/compressed"
-    if topic == "/camera/camera_info" and doubled.count % 2:
-        topic = "/rear/camera_info"
-    doubled.count += topic.endswith("compressed")
-    return topic, kind, message
-
-
 def test_the_camera_heard_most_is_chosen_and_said_and_the_user_may_choose(tmp_path):
-    doubled.count = 0
+    numbers = {"compressed": count(), "camera_info": count()}
+
+    def doubled(topic, kind, message):
+        """Every second image and its calibration are of another camera."""
+        sensor = topic.rpartition("/")[2]
+        is_rear = sensor in numbers and next(numbers[sensor]) % 2
+        return topic.replace("/camera/", "/rear/") if is_rear else topic, kind, message
+
     bag = rewritten(tmp_path, doubled)
     source = open_source(bag)
     (note,) = source.survey().notes

@@ -12,19 +12,17 @@ from fcslam.lidar.frontend import LidarConfig
 from fcslam.records import LaserScan
 from fcslam.robot.calibrating import calibrated
 from fcslam.sources import BagOptions, open_source
+from fcslam.sources.bags.codec import CAMERA_INFO, IMAGE
 from fcslam.sources.inspection import inspect
-from tests.sources.bag_messages import ROS2, odom, quaternion, save, scan, tf
+from tests.sources.bag_messages import header, odom, quaternion, save, scan, tf
 from tests.sources.carmen_text import refusal, scans_of
 from tests.sources.clouds import (
-    IMAGE,
-    INFO,
     OUSTER,
     REALSENSE,
     VELODYNE,
     Measured,
     cloud,
     depth_image,
-    header,
     plan_ranges,
     rotation,
     said,
@@ -188,9 +186,9 @@ def test_depth_images_are_scans(tmp_path, frame, xyzw):
     messages = [mounting, *(odom(START + t, (0.0, 0.0, 0.0), bag_time=START + t) for t in np.arange(0.0, 1.5, 0.1))]
     image, info = depth_image(START, "16UC1")
     for t in np.arange(0.2, 1.0, 0.1):
-        image.header = info.header = header(ROS2, START + t, frame)
+        image.header = info.header = header(START + t, frame)
         messages.append(said("/camera/depth/image_rect_raw", START + t, image, IMAGE))
-        messages.append(said("/camera/depth/camera_info", START + t, info, INFO))
+        messages.append(said("/camera/depth/camera_info", START + t, info, CAMERA_INFO))
     found = inspect(save(tmp_path / "depth.mcap", messages))
     assert found.problem is None
     assert any("looks up, so 'camera_link' is not" in note for note in found.notes) == (frame == "camera_link")

@@ -98,9 +98,6 @@ def test_memory_does_not_grow_with_the_recording(tmp_path):
     assert peak_of(open_source(long)) < 1.2 * peak_of(open_source(short)) + 20_000
 
 
-# Odometry
-
-
 def test_odometry_at_the_scans_stamp_is_the_scans_to_the_last_bit(tmp_path):
     poses = [(0.1 * k / 3, -0.7 / (k + 1), round(0.1 * k, 6)) for k in range(20)]
     said = [mounted(0.5)]
@@ -152,17 +149,12 @@ def test_stamps_that_were_never_set_are_those_of_the_recording(tmp_path):
     assert [scan.stamp for scan in scans_of(source)] == pytest.approx([100.07 + 0.2 * k for k in range(20)], abs=1e-9)
 
 
-# Ranges and beams
-
-
 def test_ranges_by_rep_117(tmp_path):
     ranges = (0.05, 0.1, 19.9, 20.0, 25.0, math.inf, -math.inf, math.nan)
     source = open_source(save(tmp_path / "run.bag", [mounted(), odom(100, (0, 0, 0)), scan(100, ranges)]))
     expected = np.array([math.nan, 0.1, 19.9, *(math.nan,) * 2, math.inf, *(math.nan,) * 2], dtype=np.float32)
     np.testing.assert_array_equal(scans_of(source)[0].ranges_m, expected)
 
-
-# Where the laser sits
 
 angles = st.floats(-3.0, 3.0)
 lengths = st.floats(-3.5, 3.5)  # in all less than the 10 m from the base from which a laser is refused
@@ -205,16 +197,6 @@ def test_the_users_pose_replaces_tf(tmp_path):
         assert source.survey().lasers[0].T_base_laser == (0.5, -0.25, 1.5)
 
 
-@pytest.mark.parametrize(("tilt_deg", "noted"), [(1.0, False), (5.0, True)])
-def test_a_slight_tilt_is_read_as_level(tmp_path, tilt_deg, noted):
-    tilted = tf(99, "base_link", "laser", rotation=quaternion(pitch=math.radians(tilt_deg)), topic="/tf_static")
-    notes = open_source(save(tmp_path / "run.bag", [tilted, *drive(12)[1:]])).survey().notes
-    assert [f"tilted by {tilt_deg:.1f} degrees" in note for note in notes] == [True] * noted
-
-
-# Choices
-
-
 def several():
     """A narrow laser that is heard more often, a wide one, and two odometries."""
     said = drive(20)
@@ -222,7 +204,7 @@ def several():
     return said + [odom(100 + 0.05 * k, (9, 9, 0), topic="/filtered") for k in range(90)]
 
 
-def test_the_widest_laser_is_chosen_and_said(tmp_path):
+def test_the_widest_laser_is_chosen_and_said_and_the_user_may_choose(tmp_path):
     bag = save(tmp_path / "run.bag", several())
     source = open_source(bag)
     assert source.survey().scan_count == 20
@@ -230,10 +212,6 @@ def test_the_widest_laser_is_chosen_and_said(tmp_path):
     assert "from /scan, not from /narrow (--sensors scan-topic" in first
     assert "from /odom, not from /filtered (--sensors odom-topic" in second
     assert str(bag) in first
-
-
-def test_the_user_chooses(tmp_path):
-    bag = save(tmp_path / "run.bag", several())
     source = open_source(bag, BagOptions(scan_topics=("/narrow",), odom_topic="filtered"))
     assert source.survey().scan_count == 30
     assert source.survey().notes == ()

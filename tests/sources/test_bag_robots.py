@@ -147,9 +147,6 @@ def test_one_recording_given_twice_is_refused(tmp_path, kind):
             check_copies(open_fleet([(each, f"name{number}") for number, each in enumerate(twice)]))
 
 
-# Frames
-
-
 def two_frames(rear_in_tf=True):
     """The scans of two lasers in turn on one topic."""
     mounts = [tf(100.0, "base_link", "front", (0.2, 0.0, 0.3), topic="/tf_static")]

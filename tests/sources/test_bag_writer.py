@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 from fcslam.errors import InputError, SourceError
 from fcslam.records import LaserModel, LaserScan, Odometry, Sweep, frozen
 from fcslam.sources import open_source, write_bag
-from tests.sources.bag_messages import ROS1, ROS2, drive, save
+from tests.sources.bag_messages import STORES, drive, save
 from tests.sources.carmen_text import only_scans, pose_at, scans_of
 
 pytestmark = pytest.mark.slow
@@ -97,7 +97,7 @@ def test_the_times_of_the_beams_come_back_and_the_motion_from_the_odometry(tmp_p
 
 def test_a_clockwise_scan_has_negative_increments_and_the_stamp_of_its_first_measured_beam(tmp_path):
     write_bag(tmp_path / "run.mcap", turning(Sweep(0.06, -0.05), 10))
-    with AnyReader([tmp_path / "run.mcap"], default_typestore=ROS2) as reader:
+    with AnyReader([tmp_path / "run.mcap"], default_typestore=STORES[False]) as reader:
         (scan,) = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/scan"]
     assert scan.header.stamp.sec + scan.header.stamp.nanosec * 1e-9 == pytest.approx(100.05, abs=1e-8)
     assert scan.angle_increment == pytest.approx(-ROUND.angle_increment_rad)
@@ -110,7 +110,7 @@ def test_a_clockwise_scan_has_negative_increments_and_the_stamp_of_its_first_mea
 def test_a_robot_without_odometry_has_none_in_the_bag(tmp_path):
     unknown = [LaserScan(s.stamp, s.ranges_m, s.laser, frozen((math.nan,) * 3)) for s in straight(5)]
     write_bag(tmp_path / "run.mcap", unknown)
-    with AnyReader([tmp_path / "run.mcap"], default_typestore=ROS2) as reader:
+    with AnyReader([tmp_path / "run.mcap"], default_typestore=STORES[False]) as reader:
         assert {topic: info.msgcount for topic, info in reader.topics.items()} == {
             "/scan": 5, "/odom": 0, "/tf": 0, "/tf_static": 1,
         }  # fmt: skip
@@ -134,7 +134,7 @@ def test_others_read_it(tmp_path, name):
     records = straight()
     records[5], records[6] = records[6], records[5]
     write_bag(tmp_path / name, records)
-    with AnyReader([tmp_path / name], default_typestore=ROS1 if name == "run.bag" else ROS2) as reader:
+    with AnyReader([tmp_path / name], default_typestore=STORES[name == "run.bag"]) as reader:
         assert {topic: (info.msgtype, info.msgcount) for topic, info in reader.topics.items()} == {
             "/scan": ("sensor_msgs/msg/LaserScan", 20),
             "/odom": ("nav_msgs/msg/Odometry", 20),

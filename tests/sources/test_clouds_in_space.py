@@ -10,25 +10,22 @@ import pytest
 from fcslam.errors import SourceError
 from fcslam.records import CloudScan, LaserScan, Odometry
 from fcslam.sources import BagOptions, open_fleet
+from fcslam.sources.bags.codec import IMU
 from fcslam.sources.clouds_in_space import reader_of
 from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud
-from tests.sources.bag_messages import ROS2, Said, odom, quaternion, save, scan, tf
-from tests.sources.clouds import VELODYNE, Measured, cloud, header, rotation, said, spinning, xyz
+from tests.sources.bag_messages import CODECS, Said, header, odom, quaternion, save, scan, tf
+from tests.sources.clouds import VELODYNE, Measured, cloud, rotation, said, spinning, xyz
 from tests.sources.test_bag_clouds import START, pose_at
 
 LIDAR = (0.1, 0.05, 0.4)
-IMU = "sensor_msgs/msg/Imu"
 IN_3D = BagOptions(in_3d=True)
 
 
 def imu(t, rate=(0.0, 0.0, 0.8)):
-    make = ROS2.types
-    vector, zeros = make["geometry_msgs/msg/Vector3"], np.zeros(9)
-    message = make[IMU](
-        header(ROS2, START + t, "imu"), make["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0), zeros,
-        vector(*rate), zeros, vector(0.0, 0.0, 9.81), zeros,
-    )  # fmt: skip
-    return Said("/imu", IMU, START + t, {"payload": bytes(ROS2.serialize_cdr(message, IMU))})
+    vector, codec = CODECS[False].vector, CODECS[False]
+    turn, force = vector("Vector3", *rate), vector("Vector3", z=9.81)
+    message = codec.make(IMU, header=header(START + t, "imu"), angular_velocity=turn, linear_acceleration=force)
+    return Said("/imu", IMU, START + t, {"payload": codec.encode(message, IMU)})
 
 
 def drive(layout=VELODYNE, R=None, scale=1.0, rings=16, mounting=LIDAR, tilt=None, sensors=True):

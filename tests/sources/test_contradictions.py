@@ -1,6 +1,7 @@
 """Scans that say nothing or contradict the odometry are counted, and nothing else is."""
 
 import numpy as np
+import pytest
 
 from fcslam.records import LaserModel, LaserScan, frozen
 from fcslam.sources import Fault
@@ -30,58 +31,56 @@ def faults(poses, odometry, world=None, change=lambda _: None, stamps=None):
     return audit.faults()
 
 
-def test_a_healthy_drive_and_a_robot_that_stands():
-    still = np.repeat(WAY, 4, axis=0)
-    found = faults(still, still)
-    assert not found
+def replaced(rows, values):
+    """A change of the ranges of these scans."""
+
+    def change(seen):
+        seen[rows] = values if np.isscalar(values) else seen[values]
+
+    return change
 
 
-def test_odometry_that_stands_still_while_the_robot_drives():
-    found = faults(WAY, np.zeros_like(WAY))
-    assert found[Fault.FROZEN_ODOMETRY].count > 0.5 * len(WAY)
+ON_THE_WAY = np.vstack((WAY[:30], np.tile(WAY[30], (len(WAY) - 30, 1))))
+"""Odometry that freezes."""
+STILL = np.repeat(WAY, 4, axis=0)
+TWICE = np.repeat(WAY, 2, axis=0)
+ALONG = np.column_stack((0.2 * np.arange(60), np.zeros((60, 2))))
+AT_REST, UNKNOWN = np.zeros((30, 3)), np.full((30, 3), np.nan)
+TWICE_STAMPS = 0.2 * (np.arange(len(TWICE)) // 2)
+ALIKE = {"change": replaced(slice(None), [0] * 30)}
+
+
+@pytest.mark.parametrize(
+    ("poses", "odometry", "options"),
+    [(STILL, STILL, {}), (AT_REST, AT_REST, ALIKE), (AT_REST, UNKNOWN, ALIKE), (ALONG, ALONG, {"world": corridor()})],
+    ids=["a drive with stops", "a robot at rest", "at rest without odometry", "a corridor, alike from everywhere"],
+)
+def test_a_healthy_robot_has_no_faults(poses, odometry, options):
+    assert not faults(poses, odometry, **options)
+
+
+@pytest.mark.parametrize(("odometry", "first"), [(np.zeros_like(WAY), 0), (ON_THE_WAY, 31)])
+def test_odometry_that_stands_still_while_the_robot_drives(odometry, first):
+    found = faults(WAY, odometry)
+    assert found[Fault.FROZEN_ODOMETRY].count > 0.5 * (len(WAY) - first)
+    assert found[Fault.FROZEN_ODOMETRY].first_line > first
     assert "scans that change while the odometry stands still" in str(found)
 
 
-def test_odometry_that_freezes_on_the_way():
-    odometry = WAY.copy()
-    odometry[30:] = odometry[30]
-    assert faults(WAY, odometry)[Fault.FROZEN_ODOMETRY].first_line > 31
-
-
-def test_scans_that_a_driver_repeats_while_the_robot_drives():
-    def freeze(seen):
-        seen[40:60] = seen[40]
-
-    found = faults(WAY, WAY, change=freeze)
-    assert found[Fault.REPEATED_SCAN] == FaultCount(19, 42)
-
-
-def test_scans_that_were_recorded_twice():
-    def double(seen):
-        seen[1::2] = seen[::2]
-
-    twice = np.repeat(WAY, 2, axis=0)
-    found = faults(twice, twice, change=double, stamps=0.2 * (np.arange(len(twice)) // 2))
-    assert found[Fault.REPEATED_SCAN].count == len(WAY)
-
-
-def test_a_robot_at_rest_may_see_the_same_again():
-    def freeze(seen):
-        seen[:] = seen[0]
-
-    still = np.zeros((30, 3))
-    for odometry in (still, np.full((30, 3), np.nan)):
-        assert not faults(still, odometry, change=freeze)
-
-
-def test_scans_of_a_covered_laser():
-    def cover(seen):
-        seen[40:50] = np.inf
-        seen[50:60] = 0.0
-
-    assert faults(WAY, WAY, change=cover).counts == {Fault.NO_RETURN: FaultCount(20, 41)}
-
-
-def test_a_corridor_looks_the_same_from_everywhere():
-    along = np.column_stack((0.2 * np.arange(60), np.zeros((60, 2))))
-    assert not faults(along, along, corridor())
+@pytest.mark.parametrize(
+    ("poses", "options", "kind", "count"),
+    [
+        (WAY, {"change": replaced(slice(40, 60), [40] * 20)}, Fault.REPEATED_SCAN, FaultCount(19, 42)),
+        (
+            TWICE,
+            {"change": replaced(slice(1, None, 2), slice(0, None, 2)), "stamps": TWICE_STAMPS},
+            Fault.REPEATED_SCAN,
+            FaultCount(len(WAY), 2),
+        ),
+        (WAY, {"change": replaced(slice(40, 50), np.inf)}, Fault.NO_RETURN, FaultCount(10, 41)),
+        (WAY, {"change": replaced(slice(50, 60), 0.0)}, Fault.NO_RETURN, FaultCount(10, 51)),
+    ],
+    ids=["repeated by the driver", "recorded twice", "covered, without a return", "covered, at 0 m"],
+)
+def test_scans_that_say_nothing_are_counted(poses, options, kind, count):
+    assert faults(poses, poses, **options).counts == {kind: count}

@@ -13,9 +13,10 @@ from fcslam.metrics.trajectory import align
 from fcslam.robot.calibrating import calibrated
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source
+from fcslam.sources.bags.codec import COMPRESSED_IMAGE
 from tests.robot import spinning
-from tests.sources.bag_messages import ROS2, Said, odom, quaternion, save, scan, tf
-from tests.sources.clouds import header, plan_ranges, said
+from tests.sources.bag_messages import CODECS, Said, header, odom, quaternion, save, scan, tf
+from tests.sources.clouds import plan_ranges, said
 
 pytestmark = pytest.mark.slow
 
@@ -269,10 +270,8 @@ def bursts():
 
 
 def packed_depth():
-    message = ROS2.types["sensor_msgs/msg/CompressedImage"](
-        header=header(ROS2, START, "camera"), format="16UC1; compressedDepth png", data=np.zeros(20, np.uint8)
-    )
-    return [*readings(1.0), said("/depth/image_raw/compressedDepth", START, message, "sensor_msgs/msg/CompressedImage")]
+    message = CODECS[False].make(COMPRESSED_IMAGE, header=header(START, "camera"), data=np.zeros(20, np.uint8))
+    return [*readings(1.0), said("/depth/image_raw/compressedDepth", START, message, COMPRESSED_IMAGE)]
 
 
 ROBOTS = {

@@ -1,6 +1,9 @@
+"""Logs by CARMEN and by other programs: raw scans, no times, decimal commas, unstated angles."""
+
 import bz2
 import gzip
 import lzma
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ from fcslam.geometry import se2
 from fcslam.records import LaserScan, Odometry
 from fcslam.sources import Fault, FaultCount, open_source
 from tests.sources.camera_records import same
-from tests.sources.carmen_text import BEAMS, drive, flaser, odom, pose_at, robotlaser, save, scans_of
+from tests.sources.carmen_text import BEAMS, drive, flaser, odom, pose_at, refusal, robotlaser, save, scans_of
 
 
 def test_every_message_becomes_its_record_in_file_order(tmp_path):
@@ -87,12 +90,22 @@ def test_the_beam_count_decides_the_angles_of_flaser(tmp_path, beams, first_deg,
 
 
 @pytest.mark.parametrize(
-    ("resolution", "fov", "span_deg"),
-    [("1.0", "6.283185", 359), ("1.0", "360", 359), ("0.5", "180", 179.5), ("1.0", "180", 179.5), ("x", "nan", 179.5)],
+    ("beams", "resolution", "fov", "span_deg"),
+    [
+        (360, "1.0", "6.283185", 359),
+        (360, "1.0", "360", 359),
+        (360, "0.5", "180", 179.5),
+        (360, "1.0", "180", 179.5),
+        (360, "x", "nan", 179.5),
+        (180, None, "360", 358),
+        (180, None, "6.283185", 358),
+        (180, None, None, 179),
+    ],
 )
-def test_parameters_state_the_field_of_view_where_they_fit_the_count(tmp_path, resolution, fov, span_deg):
-    parameters = [f"PARAM laser_front_laser_resolution {resolution} h 0", f"PARAM laser_front_laser_fov {fov} h 0"]
-    laser = open_source(save(tmp_path / "run.log", [*parameters, *drive(2, beams=360)])).survey().lasers[0]
+def test_parameters_state_the_field_of_view_where_they_fit_the_count(tmp_path, beams, resolution, fov, span_deg):
+    stated = {"resolution": resolution, "fov": fov}
+    parameters = [f"PARAM laser_front_laser_{name} {value} h 0" for name, value in stated.items() if value is not None]
+    laser = open_source(save(tmp_path / "run.log", [*parameters, *drive(2, beams=beams)])).survey().lasers[0]
     assert np.degrees(np.ptp(laser.angles_rad())) == pytest.approx(span_deg)
 
 
@@ -190,3 +203,46 @@ def test_ranges_are_read_as_python_reads_numbers(tmp_path_factory, words):
     path = save(tmp_path_factory.mktemp("log") / "run.log", [flaser(0, pose_at(0), ranges=words)])
     (scan,) = scans_of(open_source(path))
     np.testing.assert_array_equal(scan.ranges_m, np.minimum(np.float32(list(map(float, words))), np.float32(1e6)))
+
+
+def test_lines_without_times(tmp_path):
+    timed = scans_of(open_source(save(tmp_path / "timed.log", drive(12))))
+    source = open_source(save(tmp_path / "run.log", (line.rsplit(None, 3)[0] for line in drive(12))))
+    assert all(map(same, scans_of(source), (replace(scan, stamp=k) for k, scan in enumerate(timed))))
+    assert source.survey().scan_count == 12
+    assert source.faults[Fault.NO_STAMP].count == 12
+    assert not source.faults[Fault.BROKEN_LINE].count
+
+
+def test_decimal_commas(tmp_path):
+    wanted = scans_of(open_source(save(tmp_path / "points.log", drive(12))))
+    scans = scans_of(open_source(save(tmp_path / "run.log", [line.replace(".", ",") for line in drive(12)])))
+    assert len(scans) == len(wanted) == 12
+    assert all(map(same, scans, wanted))
+
+
+RANGES = tuple(round(1.0 + 0.1 * k, 3) for k in range(8))
+
+
+def raw(stamp, remissions=()):
+    words = [0, -1.4, 2.8, 0.4, 30.0, 0.01, 0, 8, *RANGES, len(remissions), *remissions, stamp, "robot", 0.0]
+    return "RAWLASER1 " + " ".join(map(str, words))
+
+
+def test_raw_scans_have_the_pose_of_the_odometry_before_them(tmp_path):
+    lines = [line for k in range(12) for line in (odom(100 + k, pose_at(k)), raw(100.1 + k, (1,) * (k % 2)))]
+    scans = scans_of(open_source(save(tmp_path / "run.log", [raw(99.0), *lines])))
+    np.testing.assert_array_equal([scan.T_odom_base for scan in scans], [pose_at(k) for k in range(12)])
+    np.testing.assert_allclose(scans[0].laser.angles_rad(), np.linspace(-1.4, 1.4, 8))
+    np.testing.assert_array_equal(scans[0].ranges_m, np.float32(RANGES))
+    assert (scans[0].stamp, scans[0].laser.max_range_m) == (100.1, 30.0)
+
+
+def test_raw_scans_beside_others_are_passed_over(tmp_path):
+    lines = [line for k, line in enumerate(drive(12)) for line in (raw(100.0 + k), line)]
+    assert len(scans_of(open_source(save(tmp_path / "run.log", lines)))) == 12
+
+
+def test_lines_that_are_no_scans_are_named(tmp_path):
+    lines = [line for k in range(5) for line in (odom(k, pose_at(k)), "RLASER 1 2 3", "TRUEPOS 1 2 3")]
+    assert "no laser scan in this CARMEN log; give a log with scans" in refusal(save(tmp_path / "run.log", lines))

@@ -1,5 +1,6 @@
-"""The motion during a scan by odometry, and odometry that is updated too rarely."""
+"""The times of the beams and the motion during a scan by odometry, and odometry that is updated too rarely."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -7,7 +8,24 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.records import Sweep
+from fcslam.sources.bags.messages import scan_of
 from fcslam.sources.motion import OdometryUpdates, moving_sweep
+from tests.ros.ros_messages import scan
+
+
+@pytest.mark.parametrize(
+    ("turn", "beam_s", "sweep"),
+    [
+        (1.0, 0.001, Sweep(0.0, 0.179)),
+        (-1.0, 0.001, Sweep(0.179, 0.0)),  # of a clockwise scanner; beams count counter-clockwise
+        *((1.0, nonsense, None) for nonsense in (0.0, -0.001, math.nan, math.inf, 1e-9, 0.1)),
+    ],
+)
+def test_the_stamp_is_the_time_of_the_first_beam_of_the_message(turn, beam_s, sweep):
+    message = scan(1.0, np.full(180, 5.0), angle_min=-turn * np.pi / 2, increment=turn * np.pi / 180, beam_s=beam_s)
+    found = scan_of(message, 0).sweep
+    assert (found and found[2:]) == (sweep and sweep[2:])
+    assert (found or ())[:2] == pytest.approx((sweep or ())[:2])
 
 
 class Reading(NamedTuple):
