@@ -9,13 +9,15 @@ import pytest
 
 from fcslam.errors import SourceError
 from fcslam.records import CloudScan, LaserScan, Odometry
-from fcslam.sources import BagOptions, open_fleet
+from fcslam.sources import BagOptions, check_copies, open_fleet
 from fcslam.sources.bags.codec import IMU
+from fcslam.sources.cloud_files import read_cloud
 from fcslam.sources.clouds_in_space import reader_of
 from fcslam.sources.point_clouds import CloudBand, CloudMounting, PointCloud
 from tests.sources.bag_messages import CODECS, Said, header, odom, quaternion, save, scan, tf
 from tests.sources.clouds import VELODYNE, Measured, cloud, rotation, said, spinning, xyz
 from tests.sources.test_bag_clouds import START, pose_at
+from tests.sources.test_bag_clouds import drive as drive_in_the_room
 
 LIDAR = (0.1, 0.05, 0.4)
 IN_3D = BagOptions(in_3d=True)
@@ -152,6 +154,12 @@ def test_a_lidar_that_is_upside_down_is_found_at_any_height(height_m, rings, is_
     assert reader.mounting.rotation == pytest.approx(R)
 
 
+def test_a_recording_that_is_given_twice_is_refused(tmp_path):
+    path = save(tmp_path / "drive.mcap", drive_in_the_room(2.5))
+    with pytest.raises(SourceError, match="ben and anna share 24 scans, so they are copies"):
+        check_copies(open_fleet([(path, "anna"), (path, "ben")], IN_3D))
+
+
 def pcd(points, kind):
     head = f"VERSION .7\nFIELDS x y z _\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 4\nWIDTH {len(points)}\nHEIGHT 1\n"
     head += f"POINTS {len(points)}\nDATA {kind}\n"
@@ -226,6 +234,23 @@ def test_names_of_clouds_give_their_times_or_a_notice_says_what_is_assumed(tmp_p
     assert np.diff([float(each.points_m[:, 0].max()) for each in scans]) == pytest.approx(0.1, abs=1e-3)
     said = [note for note in source.survey().notes if "count as 0.1 s apart; write one each to times.txt" in note]
     assert len(said) == (stamps is None)
+
+
+def timed_pcd(measured, count):
+    """A PCD file whose points have ``count`` times each, unsigned nanoseconds."""
+    rows = np.zeros(len(measured.points), [("p", "<f4", 3), ("t", "<u4", count)])
+    rows["p"], rows["t"] = measured.points, 1e9 * measured.times[:, None]
+    head = f"FIELDS x y z t\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 {count}\nPOINTS {len(rows)}\nDATA binary\n"
+    return head.encode() + rows.tobytes()
+
+
+def test_a_file_has_the_times_of_its_points_or_is_refused(tmp_path):
+    measured = spinning(pose_at, LIDAR, columns=90)
+    (tmp_path / "cloud.pcd").write_bytes(timed_pcd(measured, 1))
+    assert read_cloud(tmp_path / "cloud.pcd", 1.0).times_s == pytest.approx(measured.times, abs=1e-8)
+    (tmp_path / "cloud.pcd").write_bytes(timed_pcd(measured, 2))
+    with pytest.raises(SourceError, match=r"cloud\.pcd: is not a cloud that can be read"):
+        read_cloud(tmp_path / "cloud.pcd", 1.0)
 
 
 def test_a_broken_file_is_left_out_and_times_must_be_there(tmp_path):

@@ -38,6 +38,7 @@ _LEAST_TIME: Final = 1e8
 """Smaller names without a point are numbers of files."""
 _UNITS: Final = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 """Least stamp in each unit, and the unit in seconds; smaller ones are seconds."""
+_PCD_TYPES: Final = {"I": "i", "U": "u", "F": "f"}
 _PLY_TYPES: Final = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -67,7 +68,7 @@ class CloudFolder(CloudRecording):
 
     @cached_property
     def _times(self) -> list[float]:
-        """Of the clouds; empty: nothing gives them."""
+        """Times of the clouds, seconds; empty if nothing gives them."""
         above = (self._files[0].parent, self._files[0].parent.parent, self.path)
         for file in (place / name for place in above for name in _TIME_FILES):
             if file.is_file():
@@ -127,10 +128,10 @@ def read_cloud(path: Path, stamp: float) -> PointCloud:
     try:
         values = {".bin": _kitti, ".pcd": _pcd, ".ply": _ply}[path.suffix](content)
         points = np.stack([values[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        times = next((values[name] for name in TIMES if name in (values.dtype.names or ())), None)
+        return measured_cloud(stamp, "", points, times, LONGEST_SWEEP_S)
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise SourceError(f"{path}: is not a cloud that can be read ({error}); write it again") from error
-    times = next((values[name] for name in TIMES if name in (values.dtype.names or ())), None)
-    return measured_cloud(stamp, "", points, times, LONGEST_SWEEP_S)
 
 
 def _kitti(content: bytes) -> NDArray[Any]:
@@ -145,7 +146,7 @@ def _pcd(content: bytes) -> NDArray[Any]:
         key, *words = content[at:end].decode("ascii", "replace").split() or ["#"]
         header[key], at = words, end + 1
     names = [name if name != "_" else f"_{k}" for k, name in enumerate(header["FIELDS"])]
-    kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    kinds = [f"<{_PCD_TYPES[kind]}{int(size)}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
     counts = map(int, header.get("COUNT", ["1"] * len(names)))
     if header["DATA"] not in (["ascii"], ["binary"]):
         raise ValueError(f"DATA {' '.join(header['DATA'])}: convert it to binary with pcl_convert_pcd_ascii_binary")

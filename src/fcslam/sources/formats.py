@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fcslam.errors import SourceError
-from fcslam.records import LaserScan
+from fcslam.records import CloudScan, LaserScan, SensorRecord
 from fcslam.sources.bags.container import is_bag, parts_of
 from fcslam.sources.bags.options import BagOptions
 from fcslam.sources.contradictions import count_returns
@@ -86,11 +86,7 @@ def check_copies(sources: Sequence[Source]) -> None:
         return
     owners: dict[int, Source] = {}
     for source in sources:
-        own = {  # scans with returns, by their stamps to a millisecond, as formats round them
-            hash((round(record.stamp, 3), record.ranges_m.tobytes()))
-            for record in source.records()
-            if isinstance(record, LaserScan) and count_returns(record.ranges_m, inf)
-        }
+        own = set(filter(None, map(_fingerprint, source.records())))
         for name, shared in Counter(owners[scan].name for scan in own & owners.keys()).items():
             if shared >= _SCANS_SHARED:
                 raise SourceError(
@@ -98,6 +94,18 @@ def check_copies(sources: Sequence[Source]) -> None:
                     "recording; give each scan once"
                 )
         owners.update(dict.fromkeys(own, source))
+
+
+def _fingerprint(record: SensorRecord) -> int | None:
+    """A number that copies of a scan share; None for other records, and for a scan without a return."""
+    match record:
+        case CloudScan():
+            measured = record.points_m.tobytes()
+        case LaserScan() if count_returns(record.ranges_m, inf):
+            measured = record.ranges_m.tobytes()
+        case _:
+            return None
+    return hash((round(record.stamp, 3), measured))  # formats round stamps to a millisecond
 
 
 def robot_in(path: Path) -> tuple[Path, str | None]:

@@ -84,7 +84,10 @@ def measured_cloud(stamp: float, frame: str, points: FloatArray, times: Any, lon
     """The cloud of the points that are returns, with their ``times`` as they are sent; None: it has none."""
     measured = np.isfinite(points).all(axis=1) & points.any(axis=1)
     cloud = PointCloud(stamp, frame, points[measured], np.empty(0))
-    return cloud if times is None else _timed(cloud, times[measured], longest_s)
+    if times is None:
+        return cloud
+    exact = times.astype(np.float64 if times.dtype.kind == "f" else np.int64)  # differences of unsigned ones wrap
+    return _timed(cloud, exact[measured], longest_s)
 
 
 def _fields(content: Any) -> tuple[FloatArray, Any]:
@@ -123,10 +126,7 @@ def _fields(content: Any) -> tuple[FloatArray, Any]:
     rows = np.frombuffer(data, np.uint8, height * row_bytes).reshape(height, row_bytes)[:, : width * step]
     values = np.ascontiguousarray(rows).reshape(-1).view(layout)
     points: FloatArray = np.stack([values[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    name = next((name for name in TIMES if name in types), None)
-    if name is None:
-        return points, None
-    return points, values[name].astype(np.float64 if types[name][0].kind == "f" else np.int64)
+    return points, next((values[name] for name in TIMES if name in types), None)
 
 
 def longest_cloud_s(headers: Iterable[tuple[float, str]]) -> float:
