@@ -183,10 +183,11 @@ def test_a_map_of_ros_is_a_plan_in_its_own_coordinates(tmp_path):
 def drawing(folder, unit):
     ezdxf = pytest.importorskip("ezdxf")
     document = ezdxf.new()
-    document.units = unit
-    lengths = {6: 1.0, 4: 1000.0, 0: 1000.0}[unit]
+    document.header["$INSUNITS"] = unit
+    lengths = 1.0 if unit == 6 else 1000.0
     for x1, y1, x2, y2 in (lengths * WALLS).tolist():
         document.modelspace().add_line((x1, y1), (x2, y2))
+    document.modelspace().add_spline([(0.0, 0.0, 0.0)] * 3)  # without a length
     document.modelspace().add_text("Kitchen", height=0.3 * lengths).set_placement((3.0 * lengths, 3.0 * lengths))
     document.saveas(folder / "plan.dxf")
     return folder / "plan.dxf"
@@ -212,6 +213,8 @@ def test_a_plan_that_cannot_be_used_gets_one_line(tmp_path):
     cv2.imwrite(str(blank), np.full((50, 50), 255, np.uint8))
     (tmp_path / "broken.png").write_bytes(b"no picture")
     (tmp_path / "broken.dxf").write_text("no drawing")
+    damaged = drawing(tmp_path, 6)
+    damaged.write_text(damaged.read_text().replace("$INSUNITS\n 70\n6\n", "$INSUNITS\n 70\n1e400\n"))
     cases = [
         (picture(tmp_path), None, "--plan-scale 0.02"),
         (picture(tmp_path), -1.0, "above 0"),
@@ -220,6 +223,8 @@ def test_a_plan_that_cannot_be_used_gets_one_line(tmp_path):
         (tmp_path / "broken.png", 0.02, "cannot be read as a picture"),
         (tmp_path / "missing.png", 0.02, "cannot be read"),
         (tmp_path / "missing.yaml", None, "cannot be read"),
+        (tmp_path / "broken.dxf", None, "cannot be read"),
+        (damaged, None, "cannot be read as a DXF drawing"),
     ]
     for path, scale, text in cases:
         with pytest.raises(SourceError, match=text) as caught:
@@ -250,6 +255,7 @@ def test_a_robot_whose_ranges_stay_with_it_is_placed_with_the_others_of_its_map(
     assert report_of(placed(alone, plan_of()))["reason"] == "the map has no walls"
 
 
-def test_a_drawing_without_a_unit_gets_one_line(tmp_path):
+@pytest.mark.parametrize("unit", [0, 8, 99], ids=["none", "microinches", "none of DXF"])
+def test_a_drawing_without_a_known_unit_gets_one_line(tmp_path, unit):
     with pytest.raises(SourceError, match="does not name its unit"):
-        read_plan(drawing(tmp_path, 0))
+        read_plan(drawing(tmp_path, unit))

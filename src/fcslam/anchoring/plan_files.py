@@ -143,15 +143,16 @@ def _dxf_plan(path: Path, scale: float | None) -> tuple[OccupancyMap, float]:
         raise SourceError(f"{path}: reading DXF needs ezdxf; install it: pip install 'fcslam[plans]'") from error
     try:
         drawing: Any = ezdxf.readfile(path)
-    except (ezdxf.DXFError, UnicodeDecodeError, ValueError) as error:
+    except OSError:
+        raise
+    except Exception as error:  # of any kind if the file is damaged
         raise SourceError(f"{path}: cannot be read as a DXF drawing ({error}); save it as DXF again") from error
-    if scale is None and not drawing.units:
+    try:
+        unit_m = scale or float(units.conversion_factor(InsertUnits(drawing.units), InsertUnits.Meters))
+    except (TypeError, ValueError) as error:  # it has none, or one that is not known
         raise SourceError(
             f"{path}: the drawing does not name its unit; give metres per unit: --plan-scale 0.001 for millimetres"
-        )
-    unit_m = (
-        scale if scale is not None else float(units.conversion_factor(InsertUnits(drawing.units), InsertUnits.Meters))
-    )
+        ) from error
     lines = [unit_m * line for line in _dxf_lines(drawing, _FLATNESS_M / unit_m)]
     if not lines:
         raise SourceError(f"{path}: the drawing shows no lines in its model space")
@@ -197,6 +198,6 @@ def _dxf_lines(drawing: Any, flatness: float) -> list[FloatArray]:
                 corners = np.array([(point.x, point.y) for point in path.flattening(flatness)])
                 if len(corners) > 1 and np.isfinite(corners).all():
                     lines.append(corners)
-        except TypeError:  # an entity that is not a line
+        except Exception:  # of any kind if an entity is not a line, or has no length
             continue
     return lines
