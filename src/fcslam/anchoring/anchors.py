@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.cloud.result import FleetResult, MappedRobot
 from fcslam.errors import InputError
@@ -169,24 +170,25 @@ def _json(content: object) -> bytes:
 
 
 def _picture(plan: OccupancyMap, maps: Sequence[OccupancyMap]) -> bytes:
+    """The maps in the plan, with walls that only one of both has in colours."""
     side = maps[0].resolution_m if maps else max(plan.resolution_m, 0.05)
-    lows = [np.array(one.origin_xy) for one in (plan, *maps)]
-    highs = [
-        low + one.resolution_m * np.array(one.cells.shape[::-1]) for low, one in zip(lows, (plan, *maps), strict=True)
-    ]
-    low = np.floor(np.min(lows, axis=0) / side) * side
-    size = np.ceil((np.max(highs, axis=0) - low) / side).astype(int) + 1
-    lines, walls, free = (np.zeros(size[::-1], bool) for _ in range(3))
-    for one, state, mask in (
-        (plan, Occupancy.OCCUPIED, lines),
-        *((m, Occupancy.OCCUPIED, walls) for m in maps),
-        *((m, Occupancy.FREE, free) for m in maps),
-    ):
-        rows, columns = np.nonzero(one.cells == state)
-        at = (np.column_stack((columns, rows)) + 0.5) * one.resolution_m + np.array(one.origin_xy) - low
-        column, row = np.floor(at / side).astype(np.int64).T
-        mask[row, column] = True
-    cells = np.where(free, Occupancy.FREE, Occupancy.UNKNOWN).astype(np.uint8)
+    shown = (plan, *maps)
+    lows = np.array([one.origin_xy for one in shown])
+    highs = lows + [one.resolution_m * np.array(one.cells.shape[::-1]) for one in shown]
+    low = np.floor(lows.min(axis=0) / side) * side
+    width, height = np.ceil((highs.max(axis=0) - low) / side).astype(int) + 1
+
+    def drawn(state: Occupancy, *maps: OccupancyMap) -> NDArray[np.bool_]:
+        mask = np.zeros((height, width), bool)
+        for one in maps:
+            rows, columns = np.nonzero(one.cells == state)
+            at = (np.column_stack((columns, rows)) + 0.5) * one.resolution_m + one.origin_xy - low
+            column, row = np.floor(at / side).astype(np.int64).T
+            mask[row, column] = True
+        return mask
+
+    lines, walls = drawn(Occupancy.OCCUPIED, plan), drawn(Occupancy.OCCUPIED, *maps)
+    cells = np.where(drawn(Occupancy.FREE, *maps), Occupancy.FREE, Occupancy.UNKNOWN).astype(np.uint8)
     cells[walls] = Occupancy.OCCUPIED
     near = max(1, round(0.1 / side))
     union = OccupancyMap(cells, side, (float(low[0]), float(low[1])))
