@@ -13,7 +13,7 @@ from fcslam.geometry import se2, se3
 from fcslam.geometry.groups import compose
 from fcslam.live.records import Wiring
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
-from fcslam.ros.node import EMPTY, FINISH, INITIAL_POSE, STRING, RobotNode, await_sensors
+from fcslam.ros.node import EMPTY, FINISH, FLOOR, INITIAL_POSE, STRING, RobotNode, await_sensors
 from fcslam.ros.outputs import POSE
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.sensors import STEPS_BACK_FOR_RESTART
@@ -204,21 +204,23 @@ def running(node):
         assert not thread.is_alive()
 
 
-def test_an_initial_pose_is_refused_with_the_reason(network, robot):
+@pytest.mark.parametrize(
+    ("topic", "line"),
+    [
+        (INITIAL_POSE, "an initial pose is ignored: the robot maps, and its first scan is the origin of the map"),
+        (FLOOR, "a floor is ignored: the robot localizes in one finished map"),
+    ],
+)
+def test_what_a_robot_cannot_do_is_refused_with_the_reason(network, robot, topic, line):
     said = []
     start(network, robot, said.append)
     for _ in range(2):
-        network.say(f"/robot1/{INITIAL_POSE}", STRING, CODEC.make(STRING, data=""))
-    assert said == ["an initial pose is ignored: the robot maps, and its first scan is the origin of the map"]
+        network.say(f"/robot1/{topic}", STRING, CODEC.make(STRING, data="2"))
+    assert said == [line]
 
 
 def test_a_floor_begins_a_session_on_it(network, robot, scans):
     said = []
-    start(network, robot, said.append)
-    network.say("/robot1/fcslam/floor", STRING, CODEC.make(STRING, data="2"))
-    assert said == ["a floor is ignored: the robot localizes in one finished map"]
-    said.clear()
-    network = MemoryNetwork([offered(*topic) for topic in TOPICS])
     node = start(network, robot, said.append, None, robot.change_floor)
     for floor in ("2", "not a floor"):
         network.say("/robot1/fcslam/floor", STRING, CODEC.make(STRING, data=floor))
@@ -374,11 +376,17 @@ def test_with_a_fleet_map_is_the_joint_map_and_own_map_what_the_robot_saw(networ
     assert network.sent["/robot1/map"][-1].info.width == own.info.width
 
 
-def test_poses_and_state_of_the_fleet_are_published(network, robot):
+@pytest.fixture
+def followed(network, robot):
+    """A robot of a fleet whose node runs."""
     followed = FleetRobot(robot, None)
-    node = start(network, followed)
-    with running(node):
+    with running(start(network, followed)):
         wait_for(lambda: len(network.sent["/robot1/fleet/poses"]) >= 3)
+        yield followed
+
+
+@pytest.mark.usefixtures("followed")
+def test_poses_and_state_of_the_fleet_are_published(network):
     poses = network.sent["/robot1/fleet/poses"][0]
     assert poses.header.frame_id == "map"
     assert [(pose.position.x, pose.position.y) for pose in poses.poses] == [(0.0, 0.0), (1.0, 2.0)]
@@ -390,19 +398,15 @@ def test_poses_and_state_of_the_fleet_are_published(network, robot):
     assert (values["map"], values["age_s"], values["x"]) == ("0", "1.50", "1.0000")
 
 
-def test_how_good_the_map_is_is_published_when_it_changes(network, robot):
-    followed = FleetRobot(robot, None)
-    node = start(network, followed)
+def test_how_good_the_map_is_is_published_when_it_changes(network, followed):
     good = QualityReply(
         map=0, verdict="9 of 9 m2 are good", bar=0.05, within=10.0, error_95=0.021, good_share=1.0, drives=()
     )
     bad = good.model_copy(update={"error_95_m": None, "drives": ("drive from (0.0, 1.0) to (2.0, 1.0) again",)})
-    with running(node):
-        wait_for(lambda: len(network.sent["/robot1/fleet/poses"]) >= 2)
-        assert not network.sent["/robot1/fleet/quality"]
-        for count, quality in enumerate((bad, good), 1):
-            followed.fleet.quality = (quality,)
-            wait_for(lambda count=count: len(network.sent["/robot1/fleet/quality"]) == count)
+    assert not network.sent["/robot1/fleet/quality"]
+    for count, quality in enumerate((bad, good), 1):
+        followed.fleet.quality = (quality,)
+        wait_for(lambda count=count: len(network.sent["/robot1/fleet/quality"]) == count)
     (first,), (second,) = (message.status for message in network.sent["/robot1/fleet/quality"])
     assert (first.name, first.message, second.message) == ("map 0", bad.verdict, good.verdict)
     assert [int.from_bytes(one.level, "little") if isinstance(one.level, bytes) else one.level
@@ -412,13 +416,9 @@ def test_how_good_the_map_is_is_published_when_it_changes(network, robot):
     assert {pair.key: pair.value for pair in second.values}["error_95_m"] == "0.021"
 
 
-def test_the_frontiers_of_the_own_map_and_the_own_goal_are_published_when_they_change(network, robot):
-    followed = FleetRobot(robot, None)
-    node = start(network, followed)
-    with running(node):
-        wait_for(lambda: len(network.sent["/robot1/fleet/poses"]) >= 3)
-        followed.fleet.frontiers = (MapFrontiers(map=0, frontiers=followed.fleet.frontiers[0].frontiers[:1]),)
-        wait_for(lambda: len(network.sent["/robot1/fleet/frontiers"]) == 2)
+def test_the_frontiers_of_the_own_map_and_the_own_goal_are_published_when_they_change(network, followed):
+    followed.fleet.frontiers = (MapFrontiers(map=0, frontiers=followed.fleet.frontiers[0].frontiers[:1]),)
+    wait_for(lambda: len(network.sent["/robot1/fleet/frontiers"]) == 2)
     free, taken = network.sent["/robot1/fleet/frontiers"][0].markers
     assert [(point.x, point.y) for point in free.points] == [(5.0, 6.0)]
     assert [(point.x, point.y) for point in taken.points] == [(3.0, 4.0)]

@@ -18,7 +18,6 @@ from fcslam.sources.faults import Fault
 from fcslam.sources.point_clouds import FEWEST_FLOORS
 from fcslam.wire.limits import MAXIMUM_BEAMS
 from tests.ros.ros_messages import (
-    CODEC,
     KINDS,
     LASER_POSE,
     camera_info,
@@ -45,8 +44,10 @@ class Robot:
     """Feeds messages to sensors and keeps what comes out."""
 
     def __init__(
-        self, odometry="/odom", kinds=KINDS, camera=None, info=None, scans=("/scan",), fixes=None, imu=None, **options
-    ):
+        self, odometry="/odom", kinds=KINDS, camera=None, info=None, scans=("/scan",), fixes=None, imu=None,
+        mounted=(), **options,
+    ):  # fmt: skip
+        """``mounted`` are the frames of the sensors in tf, and their poses."""
         self.said = []
         self.kinds = kinds
         in_space = options.get("in_3d", False)
@@ -54,6 +55,8 @@ class Robot:
         self.sensors = LiveSensors(topics, "", BagOptions(**options), self.hears_of)
         self.records = []
         self.now_s = 0.0
+        for frame, (x, y, heading, *height_m) in dict(mounted).items():
+            self.hears("/tf_static", transform(0.0, "base_link", frame, (x, y, heading), *height_m))
 
     def hears_of(self, line):
         if line not in self.said:
@@ -79,9 +82,12 @@ class Robot:
         return [record.stamp for record in self.records]
 
 
+LASER, LIDAR = {"laser": LASER_POSE}, {"lidar": (*LASER_POSE, 0.4)}
+
+
 @pytest.fixture
 def robot():
-    return Robot().hears("/tf_static", transform(0.0, "base_link", "laser"))
+    return Robot(mounted=LASER)
 
 
 def test_no_scan_is_lost_while_the_mounting_is_not_known():
@@ -116,7 +122,7 @@ def test_a_scan_of_a_spinning_scanner_waits_for_the_odometry_of_its_last_beam(ro
 
 
 def test_a_robot_without_odometry_is_mapped_after_some_seconds():
-    robot = Robot(odometry=None).hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot = Robot(odometry=None, mounted=LASER)
     robot.hears("/scan", scan(1.0, RANGES))
     robot.waits(0.0)
     assert robot.records == []
@@ -213,10 +219,8 @@ def test_silence_of_a_laser_is_told(robot):
 
 
 def two_lasers(**options):
-    robot = Robot(kinds={**KINDS, "/rear": KINDS["/scan"]}, scans=("/scan", "/rear"), **options)
-    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
-    robot.hears("/tf_static", transform(0.0, "base_link", "rear", (-0.3, 0.0, 3.0)))
-    return robot
+    mounted = {**LASER, "rear": (-0.3, 0.0, 3.0)}
+    return Robot(kinds={**KINDS, "/rear": KINDS["/scan"]}, scans=("/scan", "/rear"), mounted=mounted, **options)
 
 
 def late_by(robot, laser_stops_s, until_s):
@@ -256,9 +260,8 @@ def test_a_laser_that_starts_again_is_merged_again():
 
 def test_raw_images_become_records_at_a_rate_that_is_enough():
     kinds = {**KINDS, "/image": IMAGE, "/camera_info": CAMERA_INFO}
-    robot = Robot(kinds=kinds, camera="/image", info="/camera_info")
-    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
-    robot.hears("/tf_static", transform(0.0, "base_link", "camera", (0.1, 0.0, 0.0)))
+    mounted = {**LASER, "camera": (0.1, 0.0, 0.0)}
+    robot = Robot(kinds=kinds, camera="/image", info="/camera_info", mounted=mounted)
     robot.hears("/camera_info", camera_info(0.0)).drives(np.arange(1.0, 7.0))
     for step in range(10):
         robot.now_s = 0.1 * step
@@ -277,7 +280,7 @@ def test_point_clouds_wait_for_tf_and_then_are_scans(columns, directions):
     def drives(stamps):
         for stamp in stamps:
             robot.hears("/odom", odometry(stamp, (0.0, 0.0, 0.0)))
-            robot.hears("/points", CODEC.encode(cloud(stamp, measured, VELODYNE), POINT_CLOUD))
+            robot.hears("/points", cloud(stamp, measured, VELODYNE))
 
     drives([1.0, 1.1])
     robot.waits(PATIENCE_S + 1.0)
@@ -298,13 +301,13 @@ def test_point_clouds_wait_for_tf_and_then_are_scans(columns, directions):
 def test_clouds_that_are_read_whole_come_with_the_readings_until_their_end(wheels):
     kinds = {**KINDS, "/points": POINT_CLOUD, "/imu": IMU}
     options = {} if wheels else {"odom_topic": "none"}
-    robot = Robot("/odom" if wheels else None, kinds, scans=("/points",), imu="/imu", in_3d=True, **options)
-    robot.hears("/tf_static", transform(0.0, "base_link", "lidar", LASER_POSE, height_m=0.4))
+    options |= {"scans": ("/points",), "imu": "/imu", "in_3d": True, "mounted": LIDAR}
+    robot = Robot("/odom" if wheels else None, kinds, **options)
     measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rotation(yaw=LASER_POSE[2]), columns=180)
 
     def drives(stamps):
         for stamp in stamps:
-            robot.hears("/points", CODEC.encode(cloud(stamp, measured, VELODYNE), POINT_CLOUD))
+            robot.hears("/points", cloud(stamp, measured, VELODYNE))
             for later in stamp + np.arange(0.02, 0.11, 0.02):
                 robot.hears("/imu", imu(later, 0.1))
                 if wheels:
@@ -327,11 +330,10 @@ def test_clouds_that_are_read_whole_come_with_the_readings_until_their_end(wheel
 
 
 def test_a_lidar_with_one_ring_is_refused_in_3d():
-    robot = Robot(kinds={**KINDS, "/points": POINT_CLOUD}, scans=("/points",), in_3d=True)
-    robot.hears("/tf_static", transform(0.0, "base_link", "lidar", LASER_POSE, height_m=0.4))
+    robot = Robot(kinds={**KINDS, "/points": POINT_CLOUD}, scans=("/points",), in_3d=True, mounted=LIDAR)
     measured = spinning(at_rest, (*LASER_POSE[:2], 0.4), rings=1)
     for stamp in 0.1 * np.arange(1, 1 + FEWEST_FLOORS):
-        robot.hears("/points", CODEC.encode(cloud(stamp, measured, VELODYNE), POINT_CLOUD))
+        robot.hears("/points", cloud(stamp, measured, VELODYNE))
     with pytest.raises(SourceError, match="/points has one ring, so it is a 2D laser; map it without --3d"):
         robot.hears("/odom", odometry(1.0, (0.0, 0.0, 0.0)))
 
@@ -345,12 +347,12 @@ def test_depth_images_wait_for_their_calibration():
         for stamp in stamps:
             frame.header = header(stamp, "depth_optical_frame")
             robot.hears("/odom", odometry(stamp, (0.0, 0.0, 0.0)))
-            robot.hears("/depth/image", CODEC.encode(frame, IMAGE))
+            robot.hears("/depth/image", frame)
 
     drives([1.0, 1.1])
     robot.waits(PATIENCE_S + 1.0)
     assert any("waits for the calibration of /depth/image: /depth/camera_info is silent" in each for each in robot.said)
-    robot.hears("/depth/camera_info", CODEC.encode(info, CAMERA_INFO))
+    robot.hears("/depth/camera_info", info)
     drives(1.2 + 0.1 * np.arange(SCANS_FOR_RIG + 1))
     record = robot.records[0]
     errors = np.abs(record.ranges_m - plan_ranges(0.0, 0.0, record.laser.angles_rad()))
@@ -378,8 +380,7 @@ WALL_S = 1_700_000_000.0
 @pytest.mark.parametrize("ahead_s", [18.0, -3600.0])
 @pytest.mark.parametrize("in_tf", [False, True])
 def test_clocks_that_differ_are_those_by_which_messages_arrive(robot, ahead_s, in_tf):
-    robot = Robot(None if in_tf else "/odom", kinds={**KINDS, "/fix": FIX}, fixes="/fix")
-    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
+    robot = Robot(None if in_tf else "/odom", kinds={**KINDS, "/fix": FIX}, fixes="/fix", mounted=LASER)
     for now_s in WALL_S + np.arange(1.0, 15.0, 0.5):
         at, pose = now_s + ahead_s, (now_s - WALL_S, 0.0, 0.0)
         robot.hears("/fix", fix(at, 47.0, 8.5), now_s).hears("/tf", transform(now_s, "map", "odom"), now_s)
@@ -416,9 +417,8 @@ def test_a_robot_that_never_stamps_has_the_times_at_which_messages_arrive(robot)
 
 
 def test_a_gyro_turns_a_robot_without_wheels():
-    robot = Robot(None, {**KINDS, "/imu": IMU}, imu="/imu", odom_topic="none")
-    robot.hears("/tf_static", transform(0.0, "base_link", "laser"))
-    robot.hears("/tf_static", transform(0.0, "base_link", "imu", (0.0, 0.0, 0.0), height_m=0.1))
+    mounted = {**LASER, "imu": (0.0, 0.0, 0.0, 0.1)}
+    robot = Robot(None, {**KINDS, "/imu": IMU}, imu="/imu", odom_topic="none", mounted=mounted)
     for k in range(300):
         now_s = 1.0 + 0.01 * k
         if k % 20 == 0:
@@ -509,7 +509,7 @@ def test_of_a_million_ranges_no_more_are_mapped_than_a_packet_holds(robot):
     million = np.full(1_000_000, 5.0)
     robot.drives(np.arange(1.0, 7.0)).hears("/scan", scan(7.0, million, increment=1e-6)).drives([8.0])
     assert robot.stamps == [*np.arange(1.0, 7.0), 8.0]  # another laser than the first scans'
-    dense = Robot().hears("/tf_static", transform(0.0, "base_link", "laser"))
+    dense = Robot(mounted=LASER)
     for stamp in np.arange(1.0, 7.0):
         dense.hears("/odom", odometry(stamp, (stamp, 0.0, 0.0))).hears("/scan", scan(stamp, million, increment=3e-6))
     (mapped, *_) = [MappedScans().of(record) for record in dense.records]

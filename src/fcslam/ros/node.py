@@ -102,12 +102,10 @@ class RobotNode:
                 f"another node publishes {self._map_topic}: a second robot of this name, or a map_server; stop it, or "
                 "give each robot a namespace of its own"
             )
-        self._outputs = Outputs(network, namespace, parameters.map_frame, topics.transforms[0])
+        self._outputs = Outputs(network, namespace, parameters.map_frame, topics.transforms[0], topics.in_space)
         self._transforms = TransformStream(
             nanoseconds(parameters.transform_bound), nanoseconds(parameters.transform_timeout)
         )
-        if topics.in_space:
-            self._outputs.offer_points()
         self.sensors = LiveSensors(topics, namespace, options, self._tell_once)
         self._restarts = 0
         self._subscribe()

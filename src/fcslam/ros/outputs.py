@@ -57,8 +57,11 @@ SPHERE_M: Final = 0.3
 class Outputs:
     """The publishers of one robot. Any thread may call."""
 
-    def __init__(self, network: RosNetwork, namespace: str, map_frame: str, tf: str) -> None:
-        """``tf``: topic of the transforms; those without a leading slash are in the namespace."""
+    def __init__(self, network: RosNetwork, namespace: str, map_frame: str, tf: str, in_space: bool = False) -> None:
+        """``tf``: topic of the transforms; ``in_space``: whether the topic of the points begins, so others find it.
+
+        Topics without a leading slash are in the namespace.
+        """
         self._network, self._namespace, self._map_frame, self._tf = network, namespace, map_frame, tf
         self._codec = MessageCodec(ros1=False)
         self._levels, self._shapes = self._codec.type_of(STATUS), self._codec.type_of(MARKER)
@@ -75,6 +78,7 @@ class Outputs:
             ("closures", MARKERS, LATCHED),
             (tf, TRANSFORMS, TRANSFORMED),
             (DIAGNOSTICS_TOPIC, DIAGNOSTICS, STREAMED),
+            *[(POINTS, POINT_CLOUD, LATCHED)] * in_space,
         ):
             self._publisher(topic, kind, quality)
 
@@ -136,10 +140,6 @@ class Outputs:
             for one in maps
         ]
         self._diagnose(FLEET_QUALITY, now_ns, statuses, LATCHED)
-
-    def offer_points(self) -> None:
-        """Begin the topic of ``points``, so that others find it."""
-        self._publisher(POINTS, POINT_CLOUD, LATCHED)
 
     def points(self, stamp_ns: int, points: FloatArray) -> None:
         """Publish the points (N, 3) of the map in space."""
