@@ -34,13 +34,8 @@ class Mapped:
             if keyscan is not None:
                 self.submaps += filter(None, [self.backend.add(keyscan)])
         self.submaps += self.backend.finish()
-        anchors = [submap.anchor for submap in self.submaps]
-        mapped = list(filter(None, self.mapped))
-        self.travel = np.array([keyscan.travel_m for keyscan in mapped])
-        local = np.array([keyscan.T_local_base for keyscan in mapped])
-        before = np.searchsorted(anchors, np.arange(len(local)), side="right") - 1
-        offsets = se2.between(local[np.array(anchors)[before]], local)
-        self.keyscans = se2.compose(self.backend.optimized()[before], offsets)
+        self.travel = np.array([keyscan.travel_m for keyscan in filter(None, self.mapped)])
+        self.keyscans = self.backend.keyscan_poses()
 
     @property
     def poses(self):

@@ -15,7 +15,7 @@ from fcslam.errors import PacketError
 from fcslam.geometry import se3
 from fcslam.geometry.groups import SE2, SE3, Group
 from fcslam.lidar.scan import PointScan
-from fcslam.lidar.voxel_matching import PreparedMap, align_maps, disagreement, prepared, seen_through
+from fcslam.lidar3d.voxel_matching import PreparedMap, align_maps, disagreement, prepared, seen_through
 from fcslam.places.matcher import PlaceMatch
 from fcslam.records import ClosureStatus, Constraint, FloatArray, KeyscanId, Reason, ReasonCode, frozen
 

@@ -72,12 +72,6 @@ class LidarBackend:
             rest.append(submap)
         return rest
 
-    def optimized(self) -> FloatArray:
-        """``T_map_base`` of every anchor after a robust solve (GNC), shape (S, 3), metres and radians."""
-        if self._closer.has_closures:
-            self._poses = optimize_gnc(self._graph, self._poses).poses
-        return self._poses
-
     def keyscan_poses(self) -> FloatArray:
         """``T_map_base`` of every keyscan so far, shape (N, 3), after a robust solve that changes nothing here."""
         local, anchors = np.array(self._T_local_base).reshape(-1, 3), np.array(self._closer.keyscans)
@@ -147,7 +141,7 @@ class LidarBackend:
         """
         self._unsolved += len(closures)
         if any(c.beyond_search for c in closures):
-            self.optimized()
+            self._poses = optimize_gnc(self._graph, self._poses).poses
             self._unsolved = 0
         elif self._unsolved > SOLVE_AFTER_SHARE * len(self._T_local_base) or any(c.is_surprising for c in closures):
             self._poses = optimize(self._graph, self._poses, loss=Loss.CAUCHY).poses

@@ -182,23 +182,21 @@ class LoopCloser:
                 self._recognizer.forget(self.keyscans[index])
         return len(surplus) > 0
 
-    def _is_held(self) -> NDArray[np.bool_]:
+    def _comparable(self, later: int) -> NDArray[np.bool_]:
+        """Submaps that are held and far enough before a later one on the path, shape (S,)."""
         held = np.zeros(len(self.keyscans), np.bool_)
         held[list(self._held)] = True
+        held &= self._travel[later] - self._travel > LEAST_GAP_M
         return held
 
     def _candidates(self, later: int, anchors: FloatArray, paths: FloatArray) -> list[int]:
-        travel = self._travel
         distance = np.hypot(*(anchors[:, :2] - anchors[later, :2]).T)
-        drift = drift_allowance(paths)[:, 0]
-        near = (travel[later] - travel > LEAST_GAP_M) & (distance < SIGHT_M + drift)
-        indices = np.flatnonzero(near & self._is_held())
+        indices = np.flatnonzero((distance < SIGHT_M + drift_allowance(paths)[:, 0]) & self._comparable(later))
         if not len(indices):
             return []
         visits = np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
-        best = [int(visit[np.argmin(distance[visit])]) for visit in visits]
-        best.sort(key=lambda k: distance[k])
-        return best
+        best = (int(visit[np.argmin(distance[visit])]) for visit in visits)
+        return sorted(best, key=lambda k: distance[k])
 
     def _compare(
         self, earlier: int, later: int, anchors: FloatArray, path_m: float, recognized: FloatArray | None = None
@@ -251,7 +249,7 @@ class LoopCloser:
         capped = (drift >= (WIDEST_M, WIDEST_RAD)).any(axis=1)
         unsure = capped | (distance > SIGHT_M + drift[:, 0])
         possible = distance < SIGHT_M + RECOGNIZED_DRIFT * paths
-        eligible = np.flatnonzero(unsure & possible & (travel[later] - travel > LEAST_GAP_M) & self._is_held())
+        eligible = np.flatnonzero(unsure & possible & self._comparable(later))
         number = {self.keyscans[k]: int(k) for k in eligible}
         chosen: list[int] = []
         for keyscan in recognizer.most_similar(self.keyscans[later], number, SIMILAR_PLACES) if number else ():

@@ -1,8 +1,8 @@
 """A labelled distance field: the surfaces seen so far, and for every cell near them the nearest one.
 
 Surfaces are *surfels*: running means of returns that fell together, with a normal towards the robot. A sparse grid of
-tiles stores in each cell the nearest surfel, so the distance to the map is exact (no interpolation) and costs one
-look-up. Tiles exist only near surfaces: memory follows what was seen, not the range squared.
+tiles stores in each cell the surfel nearest to its middle, so the distance to the map costs one look-up and is not
+interpolated. Tiles exist only near surfaces: memory follows what was seen, not the range squared.
 """
 
 import math

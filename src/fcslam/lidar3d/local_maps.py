@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fcslam.geometry import se3
 from fcslam.geometry.voxels import VOXEL_STEPS, to_steps, voxelised
@@ -33,6 +34,12 @@ _EXPLAINED, _OVERLAP = 0.9, 0.5
 _CLOSURE_SIGMA: Final = np.array([3e-3] * 3 + [1e-3] * 3)
 _UNMEASURED: Final = np.array([1.0] * 3 + [0.3] * 3)
 """Standard deviations of a closure where surfaces do not fix it."""
+_HEIGHTS: Final = 0.3, 2.6, 10
+"""Lowest and highest point over the floor that show whether a column is a wall, and the number of heights between."""
+_LEAST_HEIGHTS: Final = 3
+"""Heights at which a column of a wall is occupied; a table has fewer."""
+_COLUMN_M: Final = 0.1
+"""Side of a column."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +123,7 @@ class SurfaceMap:
     last: int
     points: FloatArray
     """In ``base`` of the anchor, shape (N, 3)."""
-    scans: FloatArray
+    scans: NDArray[np.int64]
     """Row of ``origins`` for each point, shape (N,)."""
     origins: FloatArray
     """Where the scanner was, shape (M, 3)."""
@@ -124,7 +131,7 @@ class SurfaceMap:
     def surfels(self) -> SurfelMap:
         """Its surfaces."""
         surfels = SurfelMap()
-        surfels.add(self.points, self.points - self.origins[self.scans.astype(np.int64)], 1.0)
+        surfels.add(self.points, self.points - self.origins[self.scans], 1.0)
         return surfels
 
     def voxel_map(self, robot: str, up: FloatArray) -> VoxelMap:
@@ -133,7 +140,7 @@ class SurfaceMap:
         T_base_ground = se3.between(self.anchor.T_odom_base, T_odom_ground)
         to_ground = se3.inverse(T_base_ground)
         origins = se3.transform(to_ground, self.origins)
-        points, seen_from = voxelised(se3.transform(to_ground, self.points), self.scans.astype(np.int64), origins)
+        points, seen_from = voxelised(se3.transform(to_ground, self.points), self.scans, origins)
         identifier = KeyscanId(robot, self.anchor.number)
         return VoxelMap(identifier, self.first, self.last, T_base_ground, points, to_steps(origins), seen_from)
 
@@ -165,7 +172,7 @@ class SurfaceMaps:
         around = [each for each in self.recent if abs(each.number - anchor.number) <= _REACH]
         T_anchor = [se3.between(anchor.T_odom_base, each.T_odom_base) for each in around]
         points = [se3.transform(T, each.points) for T, each in zip(T_anchor, around, strict=True)]
-        scans = np.repeat(np.arange(len(around)), [len(each) for each in points]).astype(np.float64)
+        scans = np.repeat(np.arange(len(around)), [len(each) for each in points])
         origins = np.array([se3.transform(T, each.origin[None])[0] for T, each in zip(T_anchor, around, strict=True)])
         return SurfaceMap(anchor, around[0].number, around[-1].number, np.concatenate(points), scans, origins)
 
@@ -192,3 +199,15 @@ class SurfaceMaps:
             if apart_m > _APART_M and distance_m < _NEAR_M + _DRIFT_SHARE * apart_m:
                 near.append((distance_m, old.anchor.number, old))
         return [old for _, _, old in sorted(near, key=lambda each: each[:2])[:_MOST_TRIED]]
+
+
+def wall_columns(local: VoxelMap) -> FloatArray:
+    """Walls from above: the middles of columns that are occupied at several heights, in ``ground``, shape (K, 2)."""
+    low_m, high_m, count = _HEIGHTS
+    points = local.points_m
+    height = np.floor((points[:, 2] - low_m) / (high_m - low_m) * count).astype(np.int64)
+    inside = (height >= 0) & (height < count)
+    cells = np.floor(points[inside, :2] / _COLUMN_M).astype(np.int64)
+    seen = np.unique(np.column_stack((cells, height[inside])), axis=0)
+    walls, heights = np.unique(seen[:, :2], axis=0, return_counts=True)
+    return np.asarray((walls[heights >= _LEAST_HEIGHTS] + 0.5) * _COLUMN_M, np.float64)

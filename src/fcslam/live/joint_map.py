@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.geometry.groups import group_of
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, draw_over
@@ -20,7 +19,6 @@ from fcslam.maps.joint_tiles import padded
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, without
 from fcslam.robot.track import ScanTrack
-from fcslam.warmup import made_up_scans
 from fcslam.wire.messages import Hello, Packet
 
 OLDEST_S = 2.0
@@ -29,7 +27,6 @@ SPEED_MPS = 0.5
 """By how much the place of a robot grows with the age of its pose."""
 WALL_CELLS = 2
 """A point so few cells from an occupied cell is of that wall."""
-FREE, OCCUPIED = int(Occupancy.FREE), int(Occupancy.OCCUPIED)
 MOST_DRAWN = 20_000
 """Most keyscans that wait to be drawn by the cloud: hours of an outage."""
 MOST_MET = 1000
@@ -57,8 +54,6 @@ class JointMap:
         self._met: dict[_ScanKey, NDArray[np.bool_]] = {}
         """Beams of the newest scans that hit other robots."""
         self._lock = threading.Lock()
-        (scan,), here, cell = made_up_scans(1), se2.IDENTITY, OccupancyMap(np.zeros((1, 1), np.uint8), 0.05, (0.0, 0.0))
-        beams_on_teammates(scan, here, here, np.zeros((1, 3)), cell, 0.5)  # no scan waits for the compiler
 
     def add(self, packets: Iterable[Packet]) -> None:
         """Keep the next keyscans until the cloud has drawn them."""
@@ -132,8 +127,8 @@ def beams_on_teammates(
 
     Args:
         scan: the scan; its odometry says how far the robot drove since the previous scan.
-        T_map_before: where the previous scan was made, in the frame of ``joint``, shape (3,); read-only.
-        T_odom_before: its odometry, shape (3,); read-only.
+        T_map_before: where the previous scan was made, in the frame of ``joint``, shape (3,).
+        T_odom_before: its odometry, shape (3,).
         places: of the other robots in that map: x, y and the age of their poses, shape (N, 3), metres and seconds.
         joint, radius_m: the joint map, and the radius of a robot.
     """
@@ -142,18 +137,12 @@ def beams_on_teammates(
     if len(near) == 0:
         return None
     origins, directions = rays_of(scan.laser, scan.sweep)
-    found: NDArray[np.bool_] | None = _on_discs(
-        scan.ranges_m,
-        origins,
-        directions,
-        scan.laser.max_range_m,
-        T_map_base,
-        near,
-        joint.cells,
-        joint.origin_xy,
-        joint.resolution_m,
-    )
-    return found
+    is_return = (scan.ranges_m > 0.0) & (scan.ranges_m < scan.laser.max_range_m)
+    points = origins + np.where(is_return, scan.ranges_m, 0.0)[:, None] * directions
+    apart2 = ((points[:, None] - near[:, :2]) ** 2).sum(axis=2)
+    found: NDArray[np.bool_] = is_return & (apart2 <= near[:, 2]).any(axis=1)
+    found[found] = _are_on_floor(se2.transform(T_map_base, points[found]), joint)
+    return found if found.any() else None
 
 
 def _near(T_map_base: FloatArray, places: FloatArray, radius_m: float, reach_m: float) -> FloatArray:
@@ -166,36 +155,13 @@ def _near(T_map_base: FloatArray, places: FloatArray, radius_m: float, reach_m: 
     return near
 
 
-@njit
-def _on_discs(  # type: ignore[no-untyped-def]
-    ranges, origins, directions, reach, T_map_base, near, cells, corner, side,
-):  # fmt: skip
-    """Whether each return lies on the free floor of a map, where a robot may be; None if none does."""
-    cos, sin = np.cos(T_map_base[2]), np.sin(T_map_base[2])
-    found, is_any = np.zeros(len(ranges), np.bool_), False
-    for i in range(len(ranges)):
-        r = ranges[i]
-        if not 0.0 < r < reach:
-            continue
-        x, y = origins[i, 0] + r * directions[i, 0], origins[i, 1] + r * directions[i, 1]
-        for k in range(len(near)):
-            if (x - near[k, 0]) ** 2 + (y - near[k, 1]) ** 2 <= near[k, 2]:
-                right, up = T_map_base[0] + cos * x - sin * y - corner[0], T_map_base[1] + sin * x + cos * y - corner[1]
-                found[i] = _is_floor(right, up, cells, side)
-                is_any = is_any or found[i]
-                break
-    return found if is_any else None
-
-
-@njit(allocates=False)
-def _is_floor(x, y, cells, side):  # type: ignore[no-untyped-def]
-    """Whether a point lies in a free cell without a wall beside it; x and y from the map's lower left corner."""
+def _are_on_floor(points: FloatArray, joint: OccupancyMap) -> NDArray[np.bool_]:
+    """Whether points of a map, shape (N, 2), lie in a free cell without a wall beside it, shape (N,)."""
+    cells, reach = joint.cells, np.arange(-WALL_CELLS, WALL_CELLS + 1)
     height, width = cells.shape
-    row, column = int(np.floor(y / side)), int(np.floor(x / side))
-    if not (0 <= row < height and 0 <= column < width) or cells[row, column] != FREE:
-        return False
-    for r in range(max(0, row - WALL_CELLS), min(height, row + WALL_CELLS + 1)):
-        for c in range(max(0, column - WALL_CELLS), min(width, column + WALL_CELLS + 1)):
-            if cells[r, c] == OCCUPIED:
-                return False
-    return True
+    column, row = np.floor((points - joint.origin_xy) / joint.resolution_m).astype(np.int64).T
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    rows, columns = (row[:, None] + reach).clip(0, height - 1), (column[:, None] + reach).clip(0, width - 1)
+    around = cells[rows[:, :, None], columns[:, None]]
+    is_free = around[:, WALL_CELLS, WALL_CELLS] == Occupancy.FREE
+    return np.asarray(inside & is_free & ~(around == Occupancy.OCCUPIED).any(axis=(1, 2)))

@@ -258,9 +258,7 @@ class Robot(LiveTracker):
         """
         own = self._require_own_map()
         self._catch_up()
-        with self._lock:
-            session = self._session
-        return own.draw(session_name(self.name, session), self._map_poses.T_map_own(session))
+        return own.draw(*self._in_own_map())
 
     def points(self) -> FloatArray | None:
         """The map in space that the robot is in: a point for each voxel, shape (N, 3), metres in ``map``.
@@ -272,16 +270,11 @@ class Robot(LiveTracker):
         if self.fleet is not None:
             return self.fleet.points()
         self._catch_up()
-        with self._lock:
-            session = self._session
-        return self._require_own_map().points(session_name(self.name, session), self._map_poses.T_map_own(session))
+        return self._require_own_map().points(*self._in_own_map())
 
     def closures(self) -> FloatArray:
         """Both ends of each loop closure that holds in the robot's map, shape (N, 2, 2), metres in ``map``."""
-        own = self._require_own_map()
-        with self._lock:
-            session = self._session
-        return own.closures(session_name(self.name, session), self._map_poses.T_map_own(session))
+        return self._require_own_map().closures(*self._in_own_map())
 
     def trajectory(self) -> RobotTrajectory:
         """All scans since the robot was last lost or changed its floor; it waits for the worker.
@@ -434,6 +427,12 @@ class Robot(LiveTracker):
         if self._own is None:
             raise InputError(f"{self.name}: the robot was made without a map of its own; give own_map=True")
         return self._own
+
+    def _in_own_map(self) -> tuple[str, FloatArray]:
+        """Name of the present session, and the pose of the robot's own map in ``map``."""
+        with self._lock:
+            session = self._session
+        return session_name(self.name, session), self._map_poses.T_map_own(session)
 
     def _is_behind(self) -> bool:
         uplink, own = self._uplink, self._own

@@ -18,7 +18,7 @@ from fcslam.lidar.own_body import SAME_M, body_radius_m, body_sectors
 from fcslam.lidar3d.ground import seen_by
 from fcslam.records import Beams, CloudScan, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
-from fcslam.robot.predicted_motion import PREDICTED, MotionPrediction
+from fcslam.robot.predicted_motion import PREDICTED, PredictedMotion
 from fcslam.robot.wheel_odometry import is_jump
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.clouds_in_space import BAND_LASER
@@ -288,7 +288,7 @@ def _tracked(
     records: Iterator[SensorRecord], config: LidarConfig, assumed_s: float
 ) -> tuple[ScanMotions, OdometryTrack | None]:
     frontend = LidarFrontend("calibration", config, PREDICTED)
-    prediction, mapped, repeated = MotionPrediction(), MappedScans(config.ignore, config.footprint), RepeatedScans()
+    motion, mapped, repeated = PredictedMotion(), MappedScans(config.ignore, config.footprint), RepeatedScans()
     unknown = np.full(3, np.nan)
     rows: list[tuple[float, ...]] = []
     odometry: list[Odometry] = []
@@ -301,15 +301,15 @@ def _tracked(
         if len(rows) == MOST_SCANS or turn_rad > ENOUGH_TURN_RAD:
             break
         beams = Sweep(*_times(record.sweep, assumed_s))
-        scan = prediction.predict(mapped.of(replace(record, T_odom_base=unknown, sweep=beams)))
+        scan = motion.place(mapped.of(replace(record, T_odom_base=unknown, sweep=beams)))
         tracking = frontend.localize(scan)
         frontend.process(scan, tracking)
-        sweep, is_matched = tracking.tracked.sweep, bool(tracking.tracked.information.any())
+        tracked, is_matched = tracking.tracked, bool(tracking.tracked.information.any())
+        sweep = tracked.sweep
         assert sweep is not None
-        pose = tracking.tracked.T_local_base if is_matched else None
-        prediction.observe(scan.stamp, pose, sweep)
+        motion.observe(scan.stamp, tracked.T_local_base, tracked)
         turn = float(sweep.displacement(sweep.last_s)[2] - sweep.displacement(sweep.first_s)[2])
-        found = unknown if pose is None else pose
+        found = tracked.T_local_base if is_matched else unknown
         rows.append((scan.stamp, *found, turn if is_matched else np.nan, sweep.first_s, sweep.last_s))
         turn_rad += abs(turn)
     columns = np.array(rows).reshape(-1, 7).T

@@ -18,9 +18,8 @@ from fcslam.geometry import se3
 from fcslam.geometry.groups import SE3
 from fcslam.lidar.frontend import ScanPose
 from fcslam.lidar.lost import has_moved_unseen
-from fcslam.lidar.voxel_map import columns
 from fcslam.lidar3d.ground import levelled, seen_by
-from fcslam.lidar3d.local_maps import KeyframeMotion, Keyframes, MappedTurn, SurfaceMap, SurfaceMaps
+from fcslam.lidar3d.local_maps import KeyframeMotion, Keyframes, MappedTurn, SurfaceMap, SurfaceMaps, wall_columns
 from fcslam.lidar3d.tracker import SETTLED, Tracked, Tracker3d, inverse
 from fcslam.records import (
     Channel,
@@ -100,11 +99,6 @@ class RobotFrontend3d:
     def odometry_fault(self) -> str | None:
         """As in ``RobotFrontend``; None once it says something again."""
         return self.odometry.check.fault if self.lacks_odometry else None
-
-    @property
-    def pose(self) -> ScanPose:
-        """Pose of the newest turn."""
-        return self.scan_poses[-1]
 
     @property
     def travel_m(self) -> float:
@@ -217,7 +211,7 @@ class RobotFrontend3d:
         voxels = local_map.voxel_map(self.robot, self._keyframes.vertical.up)
         self._send(voxels)
         if self._describes:
-            described = describe(columns(voxels))
+            described = describe(wall_columns(voxels))
             self._send(Place(voxels.id, Channel.LIDAR, DETECTOR_VERSION, local_map.first, local_map.last, *described))
 
     def _constraint(self, motion: KeyframeMotion, kind: ConstraintKind) -> Constraint:

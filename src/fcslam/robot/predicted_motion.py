@@ -27,11 +27,14 @@ Deferred = list[LaserScan | CameraImage]
 """Records since the first doubtful scan, which is the first of them."""
 
 
-class MotionPrediction:
-    """Stands in for the odometry of a robot, with constant velocity.
+class PredictedMotion:
+    """Stands in for the odometry of a robot: its velocity stays constant, and scan matching corrects it.
 
-    It is that in the sweep of the last scan, or between the last two if measured at once. A gyro measures the turns.
+    The velocity is that in the sweep of the last scan, or between the last two if measured at once. A gyro measures the
+    turns.
     """
+
+    model, jumps, may_be_frozen = PREDICTED, 0, False
 
     def __init__(self) -> None:
         self._T_odom_base = self._T_odom_last = np.zeros(3)
@@ -41,19 +44,18 @@ class MotionPrediction:
         self._elapsed_s = 0.0
         """Time between them."""
         self._last: tuple[float, FloatArray] | None = None
-        """Stamp and pose of the last scan, if it was matched."""
+        """Stamp and pose of the last scan in a frame without jumps, if it was matched."""
         self._sweep: Sweep | None = None
         """The sweep of the last scan, as it was matched."""
-        self.is_new = True
+        self._is_new = True
         """Whether the robot has not begun to move."""
         self._gyro = Gyro()
+        self._own_map: LidarFrontend | None = None
+        """Matches doubtful scans with each other, from the second one on."""
+        self._T_odom_first = se2.IDENTITY
+        """Pose of the first one of them, shape (3,)."""
 
-    def begin(self, first: LaserScan, T_smooth_base: FloatArray) -> None:
-        """Go on from a scan whose sweep has the robot's motion; its pose, shape (3,), as in ``observe``."""
-        self.is_new, self._last, self._sweep = False, (first.stamp, T_smooth_base), first.sweep
-        self._T_odom_base = first.T_odom_base
-
-    def predict(self, scan: LaserScan) -> LaserScan:
+    def place(self, scan: LaserScan) -> LaserScan:
         """The next scan with its pose in a frame of the prediction's own, and with the motion during its sweep."""
         elapsed_s = 0.0 if self._last is None else scan.stamp - self._last[0]
         self._gyro.add(scan)
@@ -80,100 +82,48 @@ class MotionPrediction:
         self._T_odom_base = se2.compose(self._T_odom_base, motion)
         return replace(scan, T_odom_base=frozen(self._T_odom_base), sweep=sweep)
 
-    def at(self, stamp: float) -> FloatArray | None:
-        """The pose (3,) at a stamp after the last scan, in the frame of the predictions; None if it is not known."""
-        share = -1.0 if self._last is None or not self._elapsed_s else (stamp - self._last[0]) / self._elapsed_s
-        if not 0.0 <= share <= LARGEST_SHARE:
-            return None
-        return frozen(se2.compose(self._T_odom_base, se2.exp(share * self._motion)))
-
-    def _goes_on(self, elapsed_s: float) -> bool:
-        """Whether the motion in the last sweep tells that in the next one, ``elapsed_s`` later."""
-        return self._sweep is not None and 0.0 < elapsed_s <= LARGEST_SHARE * self._sweep.duration_s
-
-    def moving(self, scan: LaserScan, T_smooth_base: FloatArray) -> LaserScan:
-        """A scan that was found at ``T_smooth_base``, with the velocity since the previous scan in its sweep.
-
-        A velocity that was taken over from sweep to sweep may be wrong and fit nevertheless, as all surfaces around are
-        distorted alike. The poses at the stamps show the true one.
-        """
-        elapsed_s = math.inf if self._last is None else scan.stamp - self._last[0]
-        if self._last is None or scan.sweep is None or not self._goes_on(elapsed_s):
-            return scan
-        x, y, theta = (se2.log(se2.between(self._last[1], T_smooth_base)) / elapsed_s).tolist()
-        sweep = scan.sweep._replace(velocity=(x, y, theta))
-        return replace(scan, sweep=sweep if scan.gyro is None else self._gyro.turning(sweep, scan.stamp))
-
-    def follow(self, scan: LaserScan, T_smooth_base: FloatArray, sweep: Sweep | None) -> LaserScan:
-        """A scan that waits for a decision, with its motion as it was found; the next prediction goes on from there."""
-        motion = np.zeros(3) if self._last is None else se2.between(self._last[1], T_smooth_base)
-        self._T_odom_base = se2.compose(self._T_odom_last, motion)
-        self.observe(scan.stamp, T_smooth_base, sweep)
-        return replace(scan, T_odom_base=frozen(self._T_odom_base), sweep=sweep)
-
-    def move(self, T: FloatArray) -> None:
-        """Move the frame of the predictions by ``T``, shape (3,), as the robot was found elsewhere."""
-        self._T_odom_base, self._T_odom_last = se2.compose(T, self._T_odom_base), se2.compose(T, self._T_odom_last)
-
-    def observe(self, stamp: float, T_smooth_base: FloatArray | None, sweep: Sweep | None) -> None:
-        """Where the tracker found the scan: its pose in a frame without jumps, shape (3,), and its matched sweep.
-
-        None: it was not matched; the robot is then assumed to stand still, as a wrong velocity would lead ever further.
-        """
-        elapsed_s = math.inf if self._last is None else stamp - self._last[0]
-        self.is_new, self._elapsed_s, self._sweep = False, 0.0, None
-        if self._last is not None and T_smooth_base is not None and 0.0 <= elapsed_s <= LONGEST_GAP_S:
-            self._sweep = sweep
-            if elapsed_s > 0.0:  # otherwise it is the same scan, in the map of another session
-                self._motion = se2.log(se2.between(self._last[1], T_smooth_base))
-                self._elapsed_s = elapsed_s
-                self._gyro.learn(self._last[0], stamp, float(self._motion[2]))
-        self._last = None if T_smooth_base is None else (stamp, T_smooth_base)
-
-
-class PredictedMotion:
-    """Motion of a robot without odometry: the one of the last scans goes on, and scan matching corrects it."""
-
-    model, jumps, may_be_frozen = PREDICTED, 0, False
-
-    def __init__(self) -> None:
-        self._prediction = MotionPrediction()
-        self._own_map: LidarFrontend | None = None
-        """Matches doubtful scans with each other, from the second one on."""
-        self._T_odom_first = se2.IDENTITY
-        """Pose of the first one of them, shape (3,)."""
-
-    def place(self, scan: LaserScan) -> LaserScan:
-        """The next scan with the predicted pose and velocity."""
-        return self._prediction.predict(scan)
-
     def place_image(self, image: CameraImage) -> CameraImage:
         """An image with the pose to which the motion of the last scans goes on; None if they do not tell it."""
-        return replace(image, T_odom_base=self._prediction.at(image.stamp))
+        share = -1.0 if self._last is None or not self._elapsed_s else (image.stamp - self._last[0]) / self._elapsed_s
+        if not 0.0 <= share <= LARGEST_SHARE:
+            return replace(image, T_odom_base=None)
+        return replace(image, T_odom_base=frozen(se2.compose(self._T_odom_base, se2.exp(share * self._motion))))
 
     def awaits_second(self, scan: LaserScan) -> bool:
         """Whether only a second scan shows the motion during this one."""
-        return self._prediction.is_new and scan.sweep is not None
+        return self._is_new and scan.sweep is not None
 
     def begin(self, deferred: Deferred, second: LaserScan, T_odom_first: FloatArray = se2.IDENTITY) -> LaserScan:
         """Give the first deferred scan the motion that the second one shows; returns this one, predicted from it."""
         first = deferred[0]
         assert isinstance(first, LaserScan)  # images are deferred only behind a scan
         deferred[0] = first = replace(first, sweep=first_sweep(first, second, PREDICTED))
-        self._prediction.begin(first, T_odom_first)
-        return self._prediction.predict(second)
+        self._is_new, self._last, self._sweep = False, (first.stamp, T_odom_first), first.sweep
+        self._T_odom_base = first.T_odom_base
+        return self.place(second)
 
     def track(self, scan: LaserScan, frontend: LidarFrontend, in_odom: InOdom) -> tuple[LaserScan, TrackingResult]:
-        """Localize a scan, deskew it by the motion that was found, and localize it again."""
+        """Localize a scan, deskew it by the motion that was found, and localize it again.
+
+        A velocity that was taken over from sweep to sweep may be wrong and fit nevertheless, as all surfaces around are
+        distorted alike. The poses at the stamps show the true one.
+        """
         tracking = frontend.localize(scan)
-        if not tracking.tracked.information.any():
+        elapsed_s = math.inf if self._last is None else scan.stamp - self._last[0]
+        is_matched = tracking.tracked.information.any()
+        if self._last is None or scan.sweep is None or not is_matched or not self._goes_on(elapsed_s):
             return scan, tracking
-        moving = self._prediction.moving(scan, in_odom(tracking.tracked))
-        return (scan, tracking) if moving is scan else (moving, frontend.localize(moving))
+        x, y, theta = (se2.log(se2.between(self._last[1], in_odom(tracking.tracked))) / elapsed_s).tolist()
+        sweep = scan.sweep._replace(velocity=(x, y, theta))
+        moving = replace(scan, sweep=sweep if scan.gyro is None else self._gyro.turning(sweep, scan.stamp))
+        return moving, frontend.localize(moving)
 
     def observe(self, stamp: float, T_odom_base: FloatArray, tracked: TrackedScan) -> None:
-        """Predict the next scan from where the one at ``stamp`` was found; see ``MotionPrediction.observe``."""
-        self._prediction.observe(stamp, T_odom_base if tracked.information.any() else None, tracked.sweep)
+        """Predict the next scan from where the one at ``stamp`` was found: a pose in a frame without jumps, shape (3,).
+
+        If it was not matched, the robot is assumed to stand still, as a wrong velocity would lead ever further.
+        """
+        self._observe(stamp, T_odom_base if tracked.information.any() else None, tracked.sweep)
 
     def follow(
         self, deferred: Deferred, scan: LaserScan, tracked: TrackedScan, frontend: LidarFrontend, in_odom: InOdom
@@ -184,14 +134,14 @@ class PredictedMotion:
         """
         if not deferred:
             self._own_map, self._T_odom_first = None, in_odom(tracked)
-            return self._prediction.follow(scan, self._T_odom_first, tracked.sweep)
+            return self._found(scan, self._T_odom_first, tracked.sweep)
         origin = self._T_odom_first
         if self._own_map is None:
             scan = self.begin(deferred, scan, origin)
             self._own_map = frontend.fresh()
             self._own_map.process(scans_of(deferred)[0])
         scan, own = self.track(scan, self._own_map, lambda tracked: se2.compose(origin, tracked.T_local_base))
-        scan = self._prediction.follow(scan, se2.compose(origin, own.tracked.T_local_base), own.tracked.sweep)
+        scan = self._found(scan, se2.compose(origin, own.tracked.T_local_base), own.tracked.sweep)
         self._own_map.process(scan, own._replace(state=own.state._replace(T_odom_base=scan.T_odom_base)))
         return scan
 
@@ -206,11 +156,34 @@ class PredictedMotion:
             is_elsewhere = found is not None and not gap_s
             return not (is_elsewhere or gap_s > SEEN_S or is_unplaced(scans[0], frontend))
         T = se2.compose(frontend.tracker.T_odom_base(found), se2.inverse(scans[0].T_odom_base))
-        self._prediction.move(T)
+        self._T_odom_base, self._T_odom_last = se2.compose(T, self._T_odom_base), se2.compose(T, self._T_odom_last)
         for number, record in enumerate(deferred):
             if isinstance(record, LaserScan):
                 deferred[number] = replace(record, T_odom_base=frozen(se2.compose(T, record.T_odom_base)))
         return True
+
+    def _goes_on(self, elapsed_s: float) -> bool:
+        """Whether the motion in the last sweep tells that in the next one, ``elapsed_s`` later."""
+        return self._sweep is not None and 0.0 < elapsed_s <= LARGEST_SHARE * self._sweep.duration_s
+
+    def _found(self, scan: LaserScan, T_smooth_base: FloatArray, sweep: Sweep | None) -> LaserScan:
+        """A scan that waits for a decision, with its motion as it was found; the next prediction goes on from there."""
+        motion = np.zeros(3) if self._last is None else se2.between(self._last[1], T_smooth_base)
+        self._T_odom_base = se2.compose(self._T_odom_last, motion)
+        self._observe(scan.stamp, T_smooth_base, sweep)
+        return replace(scan, T_odom_base=frozen(self._T_odom_base), sweep=sweep)
+
+    def _observe(self, stamp: float, T_smooth_base: FloatArray | None, sweep: Sweep | None) -> None:
+        """The pose (3,) at which a scan was found, and its sweep as it was matched; None: it was not matched."""
+        elapsed_s = math.inf if self._last is None else stamp - self._last[0]
+        self._is_new, self._elapsed_s, self._sweep = False, 0.0, None
+        if self._last is not None and T_smooth_base is not None and 0.0 <= elapsed_s <= LONGEST_GAP_S:
+            self._sweep = sweep
+            if elapsed_s > 0.0:  # otherwise it is the same scan, in the map of another session
+                self._motion = se2.log(se2.between(self._last[1], T_smooth_base))
+                self._elapsed_s = elapsed_s
+                self._gyro.learn(self._last[0], stamp, float(self._motion[2]))
+        self._last = None if T_smooth_base is None else (stamp, T_smooth_base)
 
 
 def scans_of(deferred: Deferred) -> list[LaserScan]:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fcslam.geometry import se3
-from fcslam.lidar.voxel_matching import PreparedMap, seen_through
+from fcslam.lidar3d.voxel_matching import PreparedMap, seen_through
 
 WALLS = np.array([[-4.0, -3.0, 0.0], [4.0, 3.0, 2.5]])
 CUPBOARD = np.array([[1.0, -2.9, 0.05], [2.2, -2.0, 1.9]])
