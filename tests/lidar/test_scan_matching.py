@@ -64,8 +64,7 @@ def test_a_prior_with_a_tail_gives_way_where_the_points_contradict_it(field):
 @pytest.mark.parametrize("heading", [0.0, 0.6, np.pi / 2])
 def test_a_corridor_is_fixed_across_and_held_by_the_prior_along(heading):
     rng = np.random.default_rng(1)
-    turned = np.array([0.0, 0.0, heading])
-    walls = np.hstack((se2.transform(turned, corridor()[:, :2]), se2.transform(turned, corridor()[:, 2:])))
+    walls = corridor(heading)
     along, across = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     poses = [np.array([*(k * along), heading]) for k in np.linspace(-2, 2, 9)]
     field = field_of([(scan_at(pose, walls, noise_m=0.01, rng=rng), pose) for pose in poses])

@@ -1,7 +1,6 @@
 """A robot with drifting odometry stays where it is in the buffer of what it saw."""
 
 from dataclasses import replace
-from itertools import accumulate
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from fcslam.records import LaserModel, frozen
 from tests.lidar.worlds import (
     LASER,
     box,
+    chain,
     corridor,
     drifting,
     drive,
@@ -46,10 +46,13 @@ def slipped(odometry, at, motion):
     """The odometry with one step that did not happen."""
     motions = se2.relative(odometry)
     motions[at] = se2.compose(motions[at], motion)
-    poses = [odometry[0]]
-    for step in motions:
-        poses.append(se2.compose(poses[-1], step))
-    return np.array(poses)
+    return chain(motions, odometry[0])
+
+
+def assert_followed(found, truth, most_m=0.10, most_deg=1.0):
+    shift, turn = pose_errors(found, truth)
+    assert shift.max() < most_m
+    assert np.rad2deg(turn.max()) < most_deg
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +71,7 @@ def test_a_drive_of_fifty_metres_is_tracked(truth, odometry, mount):
     laser = replace(LASER, T_base_laser=mount)
     poses, _ = track(recording(truth, odometry, ring(), laser))
     assert pose_errors(odometry, truth)[0].max() > 2.0
-    shift, turn = pose_errors(poses, truth)
-    assert shift.max() < 0.10
-    assert np.rad2deg(turn.max()) < 1.0
+    assert_followed(poses, truth)
 
 
 @pytest.mark.slow
@@ -84,11 +85,7 @@ def test_a_slip_is_recovered(truth, odometry, slip):
 
 def true_steps(truth, rng, noise_m=0.002, noise_rad=0.001):
     """Odometry (N, 3) that is right to a few millimetres a step."""
-    motions = se2.relative(truth) + rng.normal(size=(len(truth) - 1, 3)) * (noise_m, noise_m, noise_rad)
-    chain = [np.zeros(3)]
-    for motion in motions:
-        chain.append(se2.compose(chain[-1], motion))
-    return np.array(chain)
+    return chain(se2.relative(truth) + rng.normal(size=(len(truth) - 1, 3)) * (noise_m, noise_m, noise_rad))
 
 
 def yard(moved=(0.0, 0.0)):
@@ -116,9 +113,7 @@ def test_right_odometry_is_not_overruled_by_what_moved(moved, most_wrong):
 def test_odometry_that_was_right_is_overruled_by_a_clear_scan(slip):
     truth = drive([(-4.0, 1.2), (4.0, 1.2)])
     odometry = slipped(true_steps(truth, np.random.default_rng(5)), 60, slip)
-    shift, turn = pose_errors(track(recording(truth, odometry, yard()))[0], truth)
-    assert shift.max() < 0.10
-    assert np.rad2deg(turn.max()) < 1.0
+    assert_followed(track(recording(truth, odometry, yard()))[0], truth)
 
 
 def posts(seed):
@@ -136,9 +131,7 @@ def test_a_slip_is_found_although_a_wrong_match_explains_what_is_known(slip):
     laser = LaserModel(361, -0.5 * np.pi, np.pi / 360, 30.0)
     truth = drive([(-4.0, 1.2), (4.0, 1.2)])
     odometry = slipped(true_steps(truth, np.random.default_rng(5)), 50, slip)
-    shift, turn = pose_errors(track(recording(truth, odometry, posts(4), laser))[0], truth)
-    assert shift.max() < 0.10
-    assert np.rad2deg(turn.max()) < 1.0
+    assert_followed(track(recording(truth, odometry, posts(4), laser))[0], truth)
 
 
 @pytest.mark.slow
@@ -164,9 +157,7 @@ def test_a_bare_corridor_leaves_the_way_along_it_to_odometry(beams, step_m):
     laser = LaserModel(beams, -0.5 * np.deg2rad(beams), np.deg2rad(1.0), 20.0)
     truth = drive([(-10, 0), (5, 0)], step_m=step_m)
     poses, _ = track(recording(truth, se2.between(truth[0], truth), corridor(), laser, noise_m=0.01))
-    shift, turn = pose_errors(poses, truth)
-    assert shift.max() < 0.6
-    assert np.rad2deg(turn.max()) < 0.5
+    assert_followed(poses, truth, 0.6, 0.5)
 
 
 def test_a_standing_robot_stands(truth):
@@ -196,8 +187,7 @@ def test_the_learned_error_of_odometry_is_its_true_error(truth, share):
     model = [odometry_error(np.hypot(x, y), abs(turn), WHEELS) for x, y, turn in steps.tolist()]
     sigmas = np.array([(error.position_m, error.position_m, error.heading_rad) for error in model])
     errors = share * sigmas * rng.standard_normal(steps.shape)
-    odometry = list(accumulate(se2.compose(steps, errors), se2.compose, initial=np.zeros(3)))
-    _, tracker = track(recording(poses, np.array(odometry), ring()))
+    _, tracker = track(recording(poses, chain(se2.compose(steps, errors)), ring()))
     learned = [tracker.trust.scale(error) for error in model]
     normalised = [error.mahalanobis2(e) / 3.0 for error, e in zip(learned, errors, strict=True)]
     assert 0.5 < np.sqrt(np.mean(normalised)) < 2.0

@@ -26,12 +26,15 @@ from fcslam.records import ReasonCode
 from tests.lidar.worlds import bare_scan, box, corridor, other_room, ring, room, scan_at
 
 
-def submap_along(waypoints, walls, seed):
-    """Submap of a drive, in the base of its middle pose, and that pose."""
+def submap_along(waypoints, walls, seed, person=lambda _: np.zeros((0, 4))):
+    """Submap of a drive, in the base of its middle pose, and that pose; with a ``person`` at each number of a scan."""
     rng = np.random.default_rng(seed)
     poses = [np.array(pose) for pose in waypoints]
     anchor = poses[len(poses) // 2]
-    scans = [(scan_at(pose, walls, noise_m=0.01, rng=rng), se2.between(anchor, pose)) for pose in poses]
+    scans = []
+    for k, pose in enumerate(poses):
+        scan = scan_at(pose, np.vstack((walls, person(k))), noise_m=0.01, rng=rng)
+        scans.append((scan, se2.between(anchor, pose)))
     return build_submap(scans), anchor
 
 
@@ -107,11 +110,10 @@ def test_a_room_against_itself_turned_around_is_not_the_same_place(same_room):
 def test_a_bare_corridor_is_not_informative(heading):
     """Wherever along it one lays the other, it fits: that must be said, and its information must say it too."""
     turned = np.array([0.0, 0.0, heading])
-    walls = np.hstack((se2.transform(turned, corridor()[:, :2]), se2.transform(turned, corridor()[:, 2:])))
 
     def along(offset_m, facing, seed):
         line = [np.array([x, 0.1 * np.sin(x), facing + 0.1 * np.cos(x)]) for x in np.arange(-3, 3.1, 0.3) + offset_m]
-        return submap_along([se2.compose(turned, pose) for pose in line], walls, seed)
+        return submap_along([se2.compose(turned, pose) for pose in line], corridor(heading), seed)
 
     (a, anchor_a), (b, anchor_b) = along(0.0, 0.0, 0), along(2.0, 1.9, 1)
     found = verify(a, b, se2.between(anchor_a, anchor_b))
@@ -177,23 +179,15 @@ def test_noise_is_measured_for_the_gate_that_decides(violation, predicted):
     assert not judge(much, lambda: 1.0, False).strict, "no scanner is allowed much"
 
 
-def walking_along(waypoints, seed, stride_m=0.35):
-    """As ``submap_along`` in the room, with somebody who walks beside the robot."""
-    rng = np.random.default_rng(seed)
-    poses = [np.array(pose) for pose in waypoints]
-    anchor = poses[len(poses) // 2]
-    scans = []
-    for k, pose in enumerate(poses):
-        x, y = -1.6 + stride_m * k, 1.4
-        walls = np.vstack((room(), box(x, y, x + 0.3, y + 0.4)))
-        scans.append((scan_at(pose, walls, noise_m=0.01, rng=rng), se2.between(anchor, pose)))
-    return build_submap(scans), anchor
+def walker(stride_m):
+    """Somebody who walks beside a robot that drives ``WEST``."""
+    return lambda k: box(-1.6 + stride_m * k, 1.4, -1.3 + stride_m * k, 1.8)
 
 
 def test_somebody_who_walks_by_leaves_no_trace(same_room):
     """Where one scan had a return and many others looked through, nothing stands; the walls lose next to nothing."""
     quiet, _ = submap_along(WEST, room(), 3)
-    walked, anchor = walking_along(WEST, 3)
+    walked, anchor = submap_along(WEST, room(), 3, walker(0.35))
     where = se2.transform(anchor, walked.surface.points)
     trail = (where[:, 0] > -1.8) & (where[:, 0] < 1.8) & (where[:, 1] > 1.3) & (where[:, 1] < 1.9)
     assert trail.mean() < 0.02
@@ -203,7 +197,7 @@ def test_somebody_who_walks_by_leaves_no_trace(same_room):
 
 
 def test_somebody_who_stands_is_part_of_the_place():
-    stood, anchor = walking_along(WEST, 3, stride_m=0.0)
+    stood, anchor = submap_along(WEST, room(), 3, walker(0.0))
     where = se2.transform(anchor, stood.surface.points)
     assert (np.hypot(where[:, 0] + 1.45, where[:, 1] - 1.6) < 0.4).sum() >= 5
 

@@ -1,6 +1,7 @@
 """Drawn worlds for the LiDAR tests: walls as segments, rays cast against them, drives with drifting odometry."""
 
 from functools import lru_cache
+from itertools import accumulate
 
 import numpy as np
 
@@ -43,9 +44,10 @@ def other_room():
     return np.vstack((path((-3, -4), (2, -4), (5, -1), (5, 4), (-3, 2), closed=True), box(1.0, 0.5, 1.8, 2.0)))
 
 
-def corridor():
+def corridor(heading=0.0):
     """Two bare walls 2 m apart, longer than the laser reaches."""
-    return np.vstack((path((-60, -1), (60, -1)), path((60, 1), (-60, 1))))
+    ends = np.array([(-60, -1), (60, -1), (60, 1), (-60, 1)])
+    return se2.transform((0.0, 0.0, heading), ends).reshape(2, 4)
 
 
 @lru_cache
@@ -127,10 +129,12 @@ def drifting(poses, rng, scale=1.02, veer_rad_m=0.01, noise=0.01):
     travel = np.hypot(motions[:, 0], motions[:, 1])
     motions[:, :2] *= scale
     motions[:, 2] += veer_rad_m * travel + noise * np.sqrt(travel) * rng.normal(size=len(travel))
-    chain = [np.zeros(3)]
-    for motion in motions:
-        chain.append(se2.compose(chain[-1], motion))
-    return np.array(chain)
+    return chain(motions)
+
+
+def chain(motions, start=np.zeros(3)):  # noqa: B008 - nobody writes to it
+    """Poses (N + 1, 3) of a robot that moves by ``motions`` (N, 3), each relative to the pose before."""
+    return np.array(list(accumulate(motions, se2.compose, initial=start)))
 
 
 def recording(poses, odometry, segments, laser=LASER, *, noise_m=0.015, seed=0):

@@ -12,7 +12,6 @@ import fcslam
 from fcslam.errors import FcslamError, InputError
 from fcslam.geometry import se2
 from fcslam.live.records import Wiring
-from fcslam.robot.frontend import RobotFrontend
 from fcslam.sources import open_source
 from tests import small_fleet
 from tests.carmen_logs import write_carmen
@@ -51,10 +50,7 @@ def test_a_scan_that_a_driver_repeats_moves_the_robot_by_its_odometry_alone(robo
 
 
 def test_each_pose_is_that_of_the_tracker(robot, scans):
-    poses = drive(robot, scans)
-    frontend = RobotFrontend("anna", fcslam.MissionConfig().robot)
-    for scan in scans:
-        frontend.process(scan)
+    poses, (frontend, _) = drive(robot, scans), small_fleet.driven(scans)
     assert np.allclose([pose.T_map_base for pose in poses], frontend.scan_poses.T_odom_base(), atol=1e-3)
     assert [pose.stamp for pose in poses] == [scan.stamp for scan in scans]
     assert all(pose.is_localized for pose in poses)
@@ -180,9 +176,7 @@ def test_without_odometry_scan_matching_alone_gives_the_motion(scans):
         poses = [blind.add_scan(scan.ranges_m, scan.stamp) for scan in scans]
         with pytest.raises(InputError, match="some scans have odometry and some have not"):
             blind.add_scan(scans[-1].ranges_m, scans[-1].stamp, scans[-1].T_odom_base)
-    frontend = RobotFrontend("anna", fcslam.MissionConfig().robot)
-    for scan in scans:
-        frontend.process(scan)
+    frontend, _ = small_fleet.driven(scans)
     assert np.allclose([pose.T_map_base for pose in poses], frontend.scan_poses.T_odom_base(), atol=0.06)
     assert all(pose.T_odom_base is pose.T_map_odom is None for pose in poses)
     assert not [event for event in events if event.kind is not fcslam.EventKind.CORRECTED]

@@ -1,7 +1,7 @@
 """The front end of a robot with a 3D LiDAR: packets that the wire accepts, tracks, closures and sessions."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,7 @@ import pytest
 from fcslam.geometry import se2, se3
 from fcslam.live.records import Wiring
 from fcslam.live.robot import Robot
-from fcslam.records import Constraint, ConstraintKind, Keyscan, Place, VoxelMap
+from fcslam.records import CloudScan, Constraint, ConstraintKind, Keyscan, Place, VoxelMap
 from fcslam.robot.backend import SessionConfig
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.frontend3d import RobotFrontend3d
@@ -20,13 +20,17 @@ from tests.live.same_thread import SameThread
 from tests.spinning_lidar import PERIOD_S, circle, drive, room
 
 
+def driven_by(scans: Iterable[CloudScan], **config: object) -> tuple[RobotFrontend3d, list]:
+    """The front end of a robot after its last turn, and its packets so far."""
+    robot = RobotFrontend3d("anna", SessionConfig(**config))
+    return robot, [packet for scan in scans for packet in robot.process(scan)]
+
+
 @pytest.fixture(scope="module")
 def driven() -> tuple[RobotFrontend3d, list, np.ndarray]:
-    robot, packets, truth = RobotFrontend3d("anna", SessionConfig()), [], []
-    for scan, pose in drive(room(1), circle((6.0, 4.0), 1.6, 0.8), 130, azimuths=120):
-        packets += robot.process(scan)
-        truth.append(pose)
-    return robot, [*packets, *robot.finish()], np.array(truth)
+    turns = list(drive(room(1), circle((6.0, 4.0), 1.6, 0.8), 130, azimuths=120))
+    robot, packets = driven_by(scan for scan, _ in turns)
+    return robot, [*packets, *robot.finish()], np.array([pose for _, pose in turns])
 
 
 def test_packets_pass_the_wire_in_order(driven: tuple) -> None:
@@ -82,11 +86,14 @@ def test_keyscans_show_walls_where_they_are(driven: tuple) -> None:
     ],
 )
 def test_the_robot_itself_is_left_out(lidar: dict, is_left_out: bool) -> None:
-    robot = RobotFrontend3d("anna", SessionConfig(lidar=lidar))
-    mast = np.column_stack((np.full(40, -0.6), np.zeros(40), np.linspace(0.2, 1.0, 40))).astype(np.float32)
-    for scan, _ in drive(room(1), circle((6.0, 4.0), 1.6, 0.8), 12, azimuths=120):
-        points, times = np.vstack((scan.points_m, mast)), np.append(scan.times_s, np.zeros(40, np.float32))
-        robot.process(replace(scan, points_m=points, times_s=times))
+    mast, now = np.column_stack((np.full(40, -0.6), np.zeros(40), np.linspace(0.2, 1.0, 40))), np.zeros(40, np.float32)
+    robot, _ = driven_by(
+        (
+            replace(scan, points_m=np.vstack((scan.points_m, np.float32(mast))), times_s=np.append(scan.times_s, now))
+            for scan, _ in drive(room(1), circle((6.0, 4.0), 1.6, 0.8), 12, azimuths=120)
+        ),
+        lidar=lidar,
+    )
     keyframe, _ = robot.mapped
     assert (np.hypot(keyframe.points[:, 0] + 0.6, keyframe.points[:, 1]) > 0.15).all() == is_left_out
 
@@ -99,14 +106,14 @@ def test_settings_without_effect_are_named() -> None:
     assert notice == "robot.lidar.tracker, robot.tags: only robots with 2D LiDARs use these settings"
 
 
+def later(scan: CloudScan, shift_s: float, ahead_m: float = 0.0) -> CloudScan:
+    """The turn with other stamps, and wheels that are farther on along x."""
+    return replace(scan, stamp=scan.stamp + shift_s, wheels=scan.wheels + np.array([shift_s, ahead_m, 0.0, 0.0]))
+
+
 def test_a_clock_that_steps_back_begins_a_session() -> None:
-    robot = RobotFrontend3d("anna", SessionConfig())
-    packets = []
     turns = list(drive(room(1), circle((6.0, 4.0), 0.8, 0.2), 4))
-    for shift_s in (1000.0, 0.0):
-        for scan, _ in turns:
-            moved = scan.wheels + np.array([shift_s, 0.0, 0.0, 0.0])
-            packets += robot.process(replace(scan, stamp=scan.stamp + shift_s, wheels=moved))
+    robot, packets = driven_by(later(scan, shift_s) for shift_s in (1000.0, 0.0) for scan, _ in turns)
     packets += robot.finish()
     assert [len(track) for track in robot.tracks] == [4, 4]
     assert [packet.epoch for packet in packets if isinstance(packet.body, Hello)] == [0, 1]
@@ -114,11 +121,8 @@ def test_a_clock_that_steps_back_begins_a_session() -> None:
 
 @pytest.mark.parametrize(("moved_m", "scans"), [(0.0, [8]), (17.0, [4, 4])])
 def test_a_robot_that_drove_far_while_its_lidar_paused_begins_a_session(moved_m: float, scans: list[int]) -> None:
-    robot, packets = RobotFrontend3d("anna", SessionConfig()), []
-    for number, (scan, _) in enumerate(drive(room(1), circle((6.0, 4.0), 0.8, 0.2), 8)):
-        pause_s, ahead_m = (24.0, moved_m) if number >= 4 else (0.0, 0.0)
-        wheels = scan.wheels + np.array([pause_s, ahead_m, 0.0, 0.0])
-        packets += robot.process(replace(scan, stamp=scan.stamp + pause_s, wheels=wheels))
+    turns = [scan for scan, _ in drive(room(1), circle((6.0, 4.0), 0.8, 0.2), 8)]
+    robot, packets = driven_by([*turns[:4], *(later(scan, 24.0, moved_m) for scan in turns[4:])])
     packets += robot.finish()
     assert [len(track) for track in robot.tracks] == scans
     assert not [packet for packet in packets if isinstance(packet.body, Constraint)], "nobody saw the way"
@@ -136,10 +140,15 @@ def path(t: float) -> np.ndarray:
 @pytest.mark.parametrize("wheels", [True, False])
 @pytest.mark.parametrize("late", [0.0, 0.5, 1.0])
 def test_the_first_motion_is_right_wherever_in_a_turn_its_stamp_is(wheels: bool, late: float) -> None:
-    robot, packets, shift_s = RobotFrontend3d("anna", SessionConfig()), [], late * PERIOD_S
-    for scan, _ in drive(room(1), path, 8, azimuths=240):
-        stamped = replace(scan, stamp=scan.stamp + shift_s, times_s=scan.times_s - np.float32(shift_s))
-        packets += robot.process(stamped if wheels else replace(stamped, wheels=scan.wheels[:0]))
+    robot, packets = driven_by(
+        replace(
+            scan,
+            stamp=scan.stamp + late * PERIOD_S,
+            times_s=scan.times_s - np.float32(late * PERIOD_S),
+            wheels=scan.wheels[: wheels * len(scan.wheels)],
+        )
+        for scan, _ in drive(room(1), path, 8, azimuths=240)
+    )
     assert robot.scan_poses.T_odom_base()[0] == pytest.approx(se3.IDENTITY, abs=1e-6)
     first = next(packet.body for packet in packets if isinstance(packet.body, Constraint))
     stamps = [packet.body.stamp for packet in packets if isinstance(packet.body, Keyscan)]
@@ -174,9 +183,9 @@ def frozen(since_s: float) -> Callable[[np.ndarray], np.ndarray]:
 def test_the_path_is_right_though_the_odometry_jumps_or_stands(
     straight: list, wheels: Callable[[np.ndarray], np.ndarray], jumps: int
 ) -> None:
-    robot, packets = RobotFrontend3d("anna", SessionConfig()), []
-    for scan, _ in straight:
-        packets += robot.process(replace(scan, wheels=np.column_stack((scan.wheels[:, 0], wheels(scan.wheels)))))
+    robot, _ = driven_by(
+        replace(scan, wheels=np.column_stack((scan.wheels[:, 0], wheels(scan.wheels)))) for scan, _ in straight
+    )
     assert len(robot.tracks) == 1
     assert robot.jumps == jumps
     truth = np.array([pose for _, pose in straight])
@@ -185,8 +194,7 @@ def test_the_path_is_right_though_the_odometry_jumps_or_stands(
 
 
 def test_wheels_that_stand_while_the_clouds_change_are_named(straight: list) -> None:
-    robot = RobotFrontend3d("anna", SessionConfig())
-    for scan, _ in straight[::3]:
-        robot.process(replace(scan, wheels=scan.wheels * np.array([1.0, 0.0, 0.0, 0.0])))
+    standing = np.array([1.0, 0.0, 0.0, 0.0])
+    robot, _ = driven_by(replace(scan, wheels=scan.wheels * standing) for scan, _ in straight[::3])
     assert robot.odometry_fault == "never changes in 19 poses"
     assert robot.lacks_odometry

@@ -12,6 +12,7 @@ from fcslam.records import CameraImage, CameraModel, Keyscan, Odometry, Transfor
 from fcslam.robot.calibrating import calibrate_bag, calibrated
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source, write_bag
+from tests.lidar.worlds import chain
 from tests.robot import spinning
 from tests.small_fleet import driven
 
@@ -24,10 +25,7 @@ def integrated(scale=1.0, turn=1.0, slip=None):
     steps = se2.relative(spinning.pose_at(ticks)) * (scale, scale, turn)
     if slip is not None:
         steps[slip] *= (0.4, 0.4, 0.6)
-    poses = [np.zeros(3)]
-    for step in steps:
-        poses.append(se2.compose(poses[-1], step))
-    known = np.array(poses)
+    known = chain(steps)
     known[:, 2] = np.unwrap(known[:, 2])
     return lambda stamp: np.array([np.interp(stamp, ticks, axis) for axis in known.T])
 
@@ -49,6 +47,11 @@ def without_heading(odometry):
 
 
 READINGS = np.arange(0.0, 20.5, 0.02)
+
+
+def write_drive(path, *items):
+    """A bag of readings and scans."""
+    write_bag(path, [replace(i, stamp=i.stamp + spinning.BEGIN_S) for i in sorted(items, key=lambda item: item.stamp)])
 
 
 @pytest.mark.parametrize(
@@ -73,8 +76,7 @@ READINGS = np.arange(0.0, 20.5, 0.02)
 )  # fmt: skip
 def test_a_bag_of_a_scanner_that_spins_maps_a_room(tmp_path, odometry, delay_s):
     readings = () if odometry is None else [Odometry(t + delay_s, frozen(odometry(t))) for t in READINGS.tolist()]
-    items = sorted([*readings, *spinning.drive()], key=lambda item: item.stamp)
-    write_bag(tmp_path / "r.mcap", [replace(item, stamp=item.stamp + spinning.BEGIN_S) for item in items])
+    write_drive(tmp_path / "r.mcap", *readings, *spinning.drive())
     config = RobotConfig()
     frontend, packets = driven(calibrated(open_source(tmp_path / "r.mcap"), config.lidar).records(), config)
     assert len(frontend.tracks) == 1
@@ -88,14 +90,11 @@ def test_a_bag_of_a_scanner_that_spins_maps_a_room(tmp_path, odometry, delay_s):
 )
 def test_without_odometry_the_motion_shows_the_times_of_beams_that_a_bag_does_not_state(tmp_path, first_s, last_s):
     rng, beams_s = np.random.default_rng(3), np.linspace(first_s, last_s, spinning.LASER.beam_count)
-    write_bag(
-        tmp_path / "r.mcap",
-        [
-            replace(scan, stamp=scan.stamp + spinning.BEGIN_S, ranges_m=frozen(ranges, np.float32))
-            for scan in spinning.drive(states_sweep=False)
-            for ranges in [spinning.ranges_at(scan.stamp + beams_s, rng)]
-        ],
-    )
+    scans = [
+        replace(scan, ranges_m=frozen(spinning.ranges_at(scan.stamp + beams_s, rng), np.float32))
+        for scan in spinning.drive(states_sweep=False)
+    ]
+    write_drive(tmp_path / "r.mcap", *scans)
     bag = open_source(tmp_path / "r.mcap")
     sweep = calibrate_bag(bag, LidarConfig()).correction.sweep
     assert sweep is None if first_s == last_s else sweep == pytest.approx((first_s, last_s), abs=0.003)
@@ -111,8 +110,7 @@ def test_a_drive_along_one_circle_fixes_no_mounting(tmp_path, monkeypatch):
 
     monkeypatch.setattr(spinning, "pose_at", circle)
     readings = [Odometry(t, frozen(circle(t))) for t in READINGS.tolist()]
-    items = sorted([*readings, *spinning.drive()], key=lambda item: item.stamp)
-    write_bag(tmp_path / "r.mcap", [replace(item, stamp=item.stamp + spinning.BEGIN_S) for item in items])
+    write_drive(tmp_path / "r.mcap", *readings, *spinning.drive())
     frontend, _ = driven(calibrated(open_source(tmp_path / "r.mcap"), LidarConfig()).records())
     assert spinning.error_m(frontend.tracks[0]) < 0.02
 

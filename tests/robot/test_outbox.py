@@ -6,7 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import tempfile
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,6 +39,14 @@ def drain(outbox, packets=MAXIMUM_BATCH_PACKETS):
     return stored
 
 
+@contextmanager
+def started(path, recording="r", resume=False, limit=LIMIT):
+    """The outbox of a robot that reads a recording."""
+    with closing(Outbox(path, "alice", limit)) as outbox:
+        outbox.begin(recording, resume)
+        yield outbox
+
+
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "outbox.sqlite"
@@ -46,10 +54,8 @@ def path(tmp_path):
 
 @pytest.fixture
 def outbox(path):
-    outbox = Outbox(path, "alice", LIMIT)
-    outbox.begin("r", resume=False)
-    yield outbox
-    outbox.close()
+    with started(path) as outbox:
+        yield outbox
 
 
 class Deliveries(RuleBasedStateMachine):
@@ -117,18 +123,17 @@ TestDeliveries = Deliveries.TestCase
 def test_oldest_first_one_epoch_a_batch_and_within_the_limits(outbox, path):
     outbox.put([said(k) for k in range(5)])
     outbox.close()
-    again = Outbox(path, "alice", LIMIT)
-    again.begin("another", resume=False)
-    assert again.epoch == 1
-    again.put([said(k, LIDAR_PLACE) for k in range(3)])
-    assert again.batch(MAXIMUM_BATCH_BYTES, 100) is None, "whose epochs these are the cloud has not said"
-    again.synchronize({})
-    first = again.batch(MAXIMUM_BATCH_BYTES, 100)
-    assert (first.epoch, first.first, len(first.packets)) == (0, 0, 5)
-    size = len(first.packets[1]) + 4
-    assert len(again.batch(2 * size + 1, 100).packets) == 2
-    assert len(again.batch(1, 100).packets) == 1, "one is better than none"
-    assert list(drain(again, 2)) == [(0, 0), (0, 1), (0, 2), (0, 3), (0, 4), (1, 0), (1, 1), (1, 2)]
+    with started(path, "another") as again:
+        assert again.epoch == 1
+        again.put([said(k, LIDAR_PLACE) for k in range(3)])
+        assert again.batch(MAXIMUM_BATCH_BYTES, 100) is None, "whose epochs these are the cloud has not said"
+        again.synchronize({})
+        first = again.batch(MAXIMUM_BATCH_BYTES, 100)
+        assert (first.epoch, first.first, len(first.packets)) == (0, 0, 5)
+        size = len(first.packets[1]) + 4
+        assert len(again.batch(2 * size + 1, 100).packets) == 2
+        assert len(again.batch(1, 100).packets) == 1, "one is better than none"
+        assert list(drain(again, 2)) == [(0, 0), (0, 1), (0, 2), (0, 3), (0, 4), (1, 0), (1, 1), (1, 2)]
 
 
 def of_part(part, *ordinals):
@@ -183,16 +188,12 @@ def test_epochs_do_not_run_out_silently(outbox):
 )
 def test_starts_that_never_met_the_cloud_keep_their_order(path, starts, known, epochs):
     for start in range(starts):
-        outbox = Outbox(path, "alice", LIMIT)
-        outbox.begin("r", resume=False)
-        outbox.put([replace(said(0), time=2000.0 + start)])
-        outbox.close()
-    outbox = Outbox(path, "alice", LIMIT)
-    outbox.synchronize(known)
-    assert {epoch: decode(data).time for (epoch, _), data in drain(outbox).items()} == {
-        epoch: 2000.0 + start for start, epoch in enumerate(epochs)
-    }
-    outbox.close()
+        with started(path) as outbox:
+            outbox.put([replace(said(0), time=2000.0 + start)])
+    with closing(Outbox(path, "alice", LIMIT)) as outbox:
+        outbox.synchronize(known)
+        times = {epoch: decode(data).time for (epoch, _), data in drain(outbox).items()}
+    assert times == {epoch: 2000.0 + start for start, epoch in enumerate(epochs)}
 
 
 def test_a_cloud_that_lost_what_it_confirmed_is_found_out(outbox):
@@ -221,36 +222,31 @@ def test_what_an_earlier_start_left_for_another_mission_waits_in_vain(outbox):
 
 
 def test_a_full_outbox_leaves_places_out_and_keeps_the_chain(path):
-    size = len(encode(said(0)))
-    outbox = Outbox(path, "alice", 20 * size)
-    outbox.begin("r", resume=False)
-    assert outbox.put([said(k) for k in range(15)]) == 0
-    assert outbox.put([said(15, LIDAR_PLACE), said(16), said(17, LIDAR_PLACE)]) == 2
-    assert not outbox.is_full
-    outbox.put([said(k) for k in range(18, 23)])
-    assert outbox.is_full
-    outbox.close()
-    outbox = Outbox(path, "alice", 20 * size)
-    assert outbox.begin("r", resume=True) == 23
-    outbox.synchronize({})
-    stored = drain(outbox)
-    assert list(stored) == [(0, number) for number in range(21)], "no gap where places were left out"
-    assert not any(decode(data).body == LIDAR_PLACE for data in stored.values())
-    assert outbox.put([said(17, LIDAR_PLACE), said(23, LIDAR_PLACE)]) == 0
-    assert list(drain(outbox)) == [(0, 21)]
-    outbox.close()
+    limit = 20 * len(encode(said(0)))
+    with started(path, limit=limit) as outbox:
+        assert outbox.put([said(k) for k in range(15)]) == 0
+        assert outbox.put([said(15, LIDAR_PLACE), said(16), said(17, LIDAR_PLACE)]) == 2
+        assert not outbox.is_full
+        outbox.put([said(k) for k in range(18, 23)])
+        assert outbox.is_full
+    with closing(Outbox(path, "alice", limit)) as outbox:
+        assert outbox.begin("r", resume=True) == 23
+        outbox.synchronize({})
+        stored = drain(outbox)
+        assert list(stored) == [(0, number) for number in range(21)], "no gap where places were left out"
+        assert not any(decode(data).body == LIDAR_PLACE for data in stored.values())
+        assert outbox.put([said(17, LIDAR_PLACE), said(23, LIDAR_PLACE)]) == 0
+        assert list(drain(outbox)) == [(0, 21)]
 
 
 def test_what_is_resumed_must_be_the_same(outbox, path):
     outbox.put([said(0), said(1)])
     outbox.close()
-    again = Outbox(path, "alice", LIMIT)
-    with pytest.raises(InputError, match="another recording"):
-        again.begin("another", resume=True)
-    again.begin("r", resume=True)
-    with pytest.raises(InputError, match="packet 1 differs from that of the interrupted run"):
+    with pytest.raises(InputError, match="another recording"), started(path, "another", resume=True):
+        pass
+    differs = pytest.raises(InputError, match="packet 1 differs from that of the interrupted run")
+    with started(path, resume=True) as again, differs:
         again.put([said(0), said(1, LIDAR_PLACE)])
-    again.close()
 
 
 def test_a_folder_has_one_robot_and_one_process(outbox, path):
@@ -260,9 +256,8 @@ def test_a_folder_has_one_robot_and_one_process(outbox, path):
     outbox.close()
     with pytest.raises(InputError, match="belongs to robot 'alice', not 'bob'"):
         Outbox(path, "bob", LIMIT)
-    again = Outbox(path, "alice", LIMIT)
-    assert again.agent == agent
-    again.close()
+    with closing(Outbox(path, "alice", LIMIT)) as again:
+        assert again.agent == agent
 
 
 def test_no_outbox_is_one_line(tmp_path):
@@ -304,22 +299,19 @@ def test_a_killed_robot_has_all_that_it_put(path):
             put = next(number for number in map(int, writer.stdout) if number >= kill_at)
             writer.send_signal(signal.SIGKILL)
         most = max(most, put)
-        outbox = Outbox(path, "alice", LIMIT)
-        outbox.synchronize({})
-        (first, *_, last) = (decode(data).sequence for data in outbox.batch(10**9, 10**9).packets)
-        assert (first, last + 1) == (0, outbox.waiting.packets)
-        assert last >= most
-        outbox.close()
+        with closing(Outbox(path, "alice", LIMIT)) as outbox:
+            outbox.synchronize({})
+            (first, *_, last) = (decode(data).sequence for data in outbox.batch(10**9, 10**9).packets)
+            assert (first, last + 1) == (0, outbox.waiting.packets)
+            assert last >= most
 
 
 def test_a_damaged_packet_is_told_by_its_number(path):
     """Each waiting packet has its digest."""
-    outbox = Outbox(path, "alice", LIMIT)
-    outbox.begin("r", resume=False)
-    outbox.put(said(k, body) for k, body in enumerate([HELLO, *[KEYSCAN] * 4]))
-    outbox.synchronize({})
-    outbox.acknowledge(0, 1)
-    outbox.close()
+    with started(path) as outbox:
+        outbox.put(said(k, body) for k, body in enumerate([HELLO, *[KEYSCAN] * 4]))
+        outbox.synchronize({})
+        outbox.acknowledge(0, 1)
     content = path.read_bytes()
     with closing(sqlite3.connect(path)) as file:
         (data,) = file.execute("SELECT data FROM packets WHERE ordinal = 2").fetchone()
@@ -333,10 +325,8 @@ def test_a_damaged_packet_is_told_by_its_number(path):
 
 
 def test_a_cut_outbox_is_told(path):
-    outbox = Outbox(path, "alice", LIMIT)
-    outbox.begin("r", resume=False)
-    outbox.put(said(k, KEYSCAN) for k in range(100))
-    outbox.close()
+    with started(path) as outbox:
+        outbox.put(said(k, KEYSCAN) for k in range(100))
     content = path.read_bytes()
     for share in (0.01, 0.5, 0.99):
         path.write_bytes(content[: int(share * len(content))])
@@ -350,13 +340,10 @@ def test_a_new_start_forgets_what_the_cloud_has(outbox, path):
     outbox.synchronize({})
     outbox.acknowledge(0, 2)
     outbox.close()
-    again = Outbox(path, "alice", LIMIT)
-    again.begin("another", resume=False)
-    again.synchronize({0: 3})
-    assert list(drain(again)) == [(0, 3), (0, 4)]
-    again.close()
-    third = Outbox(path, "alice", LIMIT)
-    third.begin("a third", resume=False)
-    third.close()
+    with started(path, "another") as again:
+        again.synchronize({0: 3})
+        assert list(drain(again)) == [(0, 3), (0, 4)]
+    with started(path, "a third"):
+        pass
     with sqlite3.connect(path) as database:
         assert database.execute("SELECT count(*) FROM packets").fetchall() == [(0,)]

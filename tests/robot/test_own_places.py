@@ -9,7 +9,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.closing import LoopCloser
 from fcslam.lidar.submap import build_submap
 from fcslam.robot.backend import OwnPlaces
-from tests.lidar.worlds import box, path, scan_at, shifted
+from tests.lidar.worlds import box, chain, path, scan_at, shifted
 
 pytestmark = pytest.mark.slow
 
@@ -49,10 +49,7 @@ def veering(truth):
     """The drive as a robot believes it that turns too far."""
     motions = se2.relative(truth)
     motions[:, 2] += VEER_RAD_M * np.hypot(motions[:, 0], motions[:, 1])
-    poses = [truth[0]]
-    for motion in motions:
-        poses.append(se2.compose(poses[-1], motion))
-    return poses
+    return chain(motions, truth[0])
 
 
 @lru_cache
@@ -70,13 +67,9 @@ def submaps_of(world, length_m):
 
 def closures(submaps, poses, recognizer):
     closer = LoopCloser(recognizer)
-    anchors = np.array([poses[anchor] for anchor, _ in submaps])
+    anchors = poses[[anchor for anchor, _ in submaps]]
     found = [closer.add(at, at * STEP_M, submap, anchors[: k + 1]) for k, (at, submap) in enumerate(submaps)]
     return [(2 * c.earlier, 2 * c.later, c) for closures in found for c in closures]
-
-
-def own_places():
-    return OwnPlaces()
 
 
 def test_a_loop_whose_drift_is_beyond_the_search_is_closed():
@@ -86,7 +79,7 @@ def test_a_loop_whose_drift_is_beyond_the_search_is_closed():
     drift = se2.between(se2.between(poses[0], poses[end]), se2.between(truth[0], truth[end]))
     assert np.hypot(drift[0], drift[1]) > 25.0
     assert closures(submaps, poses, None) == []
-    found = closures(submaps, poses, own_places())
+    found = closures(submaps, poses, OwnPlaces())
     assert len(found) >= 3
     for i, j, closure in found:
         error = se2.between(se2.between(truth[i], truth[j]), closure.check.T_a_b)
@@ -95,7 +88,7 @@ def test_a_loop_whose_drift_is_beyond_the_search_is_closed():
 
 def test_what_is_forgotten_is_not_recognised():
     _, submaps = submaps_of(blocks, 60.0)
-    places = own_places()
+    places = OwnPlaces()
     for anchor, submap in submaps[:10]:
         places.store(anchor, submap.surface.points)
     keyscans = [anchor for anchor, _ in submaps[:10]]
@@ -107,4 +100,4 @@ def test_what_is_forgotten_is_not_recognised():
 
 def test_places_that_look_alike_do_not_close_a_loop():
     truth, submaps = submaps_of(equal_doors, 180.0)
-    assert closures(submaps, list(truth), own_places()) == []
+    assert closures(submaps, truth, OwnPlaces()) == []

@@ -12,13 +12,13 @@ from fcslam.config import dump, load
 from fcslam.features.detector import OnnxConfig, OnnxDetector
 from fcslam.geometry import se2
 from fcslam.records import Channel, ClosureStatus, Keyscan, LaserScan, Place, frozen
-from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.frontend import RobotConfig
 from fcslam.wire.messages import Hello, Packet
 from fcslam.wire.packets import encode
 from tests.features.networks import tiny_network
 from tests.features.pictures import image_at
 from tests.lidar.worlds import drifting, drive, path, recording, ring
-from tests.small_fleet import driven
+from tests.small_fleet import driven, feed
 
 pytestmark = pytest.mark.slow
 
@@ -168,21 +168,16 @@ def test_what_cameras_saw_joins_two_maps():
     config, cloud, truth = RobotConfig(channels=(Channel.CAMERA,)), Cloud(FleetConfig(), 0), {}
     for number, way in enumerate(ways):
         records, poses = records_of(way, 10 + number)
-        robot = RobotFrontend(f"r{number}", config)
-        for record in records:
-            for packet in robot.process(record):
-                cloud.receive(encode(packet))
-        for packet in robot.finish():
-            cloud.receive(encode(packet))
-        stamps = [record.stamp for record in records if isinstance(record, LaserScan)]
-        truth[robot.robot] = (stamps, poses)
+        robot, packets = driven(records, config, f"r{number}")
+        feed(cloud, packets)
+        truth[robot.robot] = poses[0]
     result = cloud.finalize()
     assert {robot.map_index for robot in result.robots} == {0}
     accepted = [c for c in result.closures if c.status is ClosureStatus.ACCEPTED and c.i.robot != c.j.robot]
     assert len(accepted) >= 3
     assert {closure.channel for closure in accepted} == {Channel.CAMERA}
     starts = [robot.T_map_base[0] for robot in result.robots]
-    true_starts = [truth[robot.robot][1][0] for robot in result.robots]
+    true_starts = [truth[robot.robot] for robot in result.robots]
     off = se2.between(se2.between(*true_starts), se2.between(*starts))
     assert np.hypot(off[0], off[1]) < 0.1
 
@@ -223,8 +218,7 @@ def test_corridors_that_repeat_themselves_join_nothing_by_their_images_alone():
         records, _ = records_of([(start, 0.0), (start + 9.0, 0.0)], 10 + number, walls, lambda number: number // count)
         _, packets = driven(records, config, f"r{number}")
         assert any(isinstance(packet.body, Place) for packet in packets)
-        for packet in packets:
-            cloud.receive(encode(packet))
+        feed(cloud, packets)
     result = cloud.finalize()
     assert len({robot.map_index for robot in result.robots}) == 2
     assert not [c for c in result.closures if c.status is ClosureStatus.ACCEPTED and c.i.robot != c.j.robot]

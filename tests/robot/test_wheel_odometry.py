@@ -10,6 +10,7 @@ from fcslam.records import CameraImage, CameraModel, Channel, LaserModel, LaserS
 from fcslam.robot.frontend import RobotConfig
 from fcslam.robot.wheel_odometry import WheelOdometry
 from tests import small_fleet
+from tests.lidar.worlds import chain
 
 LASER = LaserModel(3, -1.0, 1.0, 10.0)
 CAMERA = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0, Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
@@ -22,10 +23,7 @@ def scans_of(poses, step_s=0.1):
 
 def wandering(count, seed):
     rng = np.random.default_rng(seed)
-    poses = [np.zeros(3)]
-    for motion in rng.uniform((-0.05, -0.05, -0.1), (0.2, 0.05, 0.1), (count - 1, 3)):
-        poses.append(se2.compose(poses[-1], motion))
-    return np.array(poses)
+    return chain(rng.uniform((-0.05, -0.05, -0.1), (0.2, 0.05, 0.1), (count - 1, 3)))
 
 
 def bridged(poses):
