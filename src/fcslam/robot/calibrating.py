@@ -301,7 +301,8 @@ def _tracked(
         if len(rows) == MOST_SCANS or turn_rad > ENOUGH_TURN_RAD:
             break
         beams = Sweep(*_times(record.sweep, assumed_s))
-        scan = motion.place(mapped.of(replace(record, T_odom_base=unknown, sweep=beams)))
+        # without the gyro, whose turns in the assumed sweep would hide what the points say about its times
+        scan = motion.place(mapped.of(replace(record, T_odom_base=unknown, sweep=beams, gyro=None)))
         tracking = frontend.localize(scan)
         frontend.process(scan, tracking)
         tracked, is_matched = tracking.tracked, bool(tracking.tracked.information.any())

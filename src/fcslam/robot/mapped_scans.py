@@ -50,7 +50,7 @@ class MappedScans:
         ranges_m = rounded(ranges_m, laser.max_range_m)
         if not count_returns(ranges_m, laser.max_range_m):
             ranges_m = frozen(np.zeros_like(ranges_m), np.float32)
-        return LaserScan(scan.stamp, ranges_m, laser, scan.T_odom_base, sweep, scan.on_teammates)
+        return replace(scan, ranges_m=ranges_m, laser=laser, sweep=sweep)
 
     def cloud(self, scan: CloudScan) -> CloudScan:
         """The turn of a 3D LiDAR as it is mapped: without its points in the sectors and within the footprint."""
