@@ -55,16 +55,13 @@ def demo(
     _prepare(output)
     prepare_fleet_folder(output / RECORDINGS, settings, seed)
     console = notices(quiet)
-
-    def begin(stage: int, text: str) -> None:
-        print_line(console, f"{stage} of 3 {text}")
-
-    begin(1, f"simulate: {robots} robots drive {settings.path_length_m:g} m each; their starts are unknown")
+    path_m = settings.path_length_m
+    print_line(console, f"1 of 3 simulate: {robots} robots drive {path_m:g} m each; their starts are unknown")
     recordings = record_fleet(fleet, output / RECORDINGS, console)
     sources = [open_source(place) for place in recordings]
-    begin(2, "map each robot, recognise places, fuse the maps")
+    print_line(console, "2 of 3 map each robot, recognise places, fuse the maps")
     map_sources(sources, MissionConfig(seed=seed), MissionInputs(), output / RUN, console, force=True)
-    begin(3, "evaluate: compare with the truth")
+    print_line(console, "3 of 3 evaluate: compare with the truth")
     report_fleet(output / RUN, output / RECORDINGS, output / TABLE, console)
     typer.echo(f"{time.perf_counter() - began:.0f} s in all")
     for content, name in (("run folder", RUN), ("map", f"{RUN}/map.png"), ("all numbers", TABLE)):

@@ -1,4 +1,4 @@
-"""Options that several commands share, each declared once, what they choose, and the examples in help."""
+"""Options that several commands share, each declared once, and what they choose."""
 
 import os
 import re

@@ -69,12 +69,12 @@ def play(
     quiet: Quiet = False,
 ) -> None:
     """Map a recording, and send its places and keyscans to the cloud, through outages and restarts."""
+    from fcslam.api import notes_in_space
     from fcslam.cli.progress import ProgressDisplay
     from fcslam.cloud.sessions import check_robot
     from fcslam.live.records import Wiring
     from fcslam.live.robot import Robot
     from fcslam.records import CloudScan
-    from fcslam.sources import planar_note
     from fcslam.sources.faults import Fault
     from fcslam.storage.files import keep_private
 
@@ -86,7 +86,7 @@ def play(
     console = notices(quiet)
     in_3d = settings.fleet.dimensions == 3
     opened, survey = open_recording(recording, sensors, console, in_3d, settings.robot.lidar)
-    print_notes(console, filter(None, [planar_note([opened]) * in_3d]))
+    print_notes(console, notes_in_space([opened], settings))
     try:
         check_robot(opened.name)
     except PacketError as error:

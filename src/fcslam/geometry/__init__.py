@@ -1,1 +1,1 @@
-"""Rigid motions of the plane and the alignments of point sets."""
+"""Rigid motions of the plane and of space, alignments of points, and the geometry of beams, cells and voxels."""

@@ -24,8 +24,9 @@ _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*([1-9]\d{0,6})\s+([1-9]
 
 
 GEOREFERENCE: Final = "_georeference.json"
-RMF_YAML: Final = "rmf.yaml"
 """End of the name of the file, beside a map, that says how the map lies on the earth."""
+RMF_YAML: Final = "rmf.yaml"
+"""Name of the file that says where Open-RMF has the map."""
 FINEST_M: Final = 1e-4
 COARSEST_M: Final = 1e3
 FARTHEST_M: Final = 1e7

@@ -101,33 +101,25 @@ def _seen(run: Run, mission: SavedMission, map_index: int, name: str) -> _Seen:
     }
     if not members:
         raise SourceError(f"{name}: has no map {map_index}; the first one is 0")
-
-    def is_mapped(keyscan: Keyscan) -> bool:
-        return bool(keyscan.stamp <= members[keyscan.id.robot].stamps.max() + SAME_STAMP_S)
-
     lasers: dict[str, Sequence[LaserModel]] = {}
     keyscans: list[Keyscan] = []
     poses: list[FloatArray] = []
     for sent in mission.packets.values():
         for sized in sent:
             packet = in_session(sized.packet)
-            if packet.robot not in members:
+            robot, keyscan = members.get(packet.robot), packet.body
+            if robot is not None and isinstance(keyscan, Hello):
+                lasers[packet.robot] = keyscan.lasers
+            if robot is None or not isinstance(keyscan, Keyscan) or keyscan.stamp > robot.stamps.max() + SAME_STAMP_S:
                 continue
-            if isinstance(packet.body, Hello):
-                lasers[packet.robot] = packet.body.lasers
-            elif isinstance(packet.body, Keyscan) and is_mapped(packet.body):
-                keyscans.append(packet.body)
+            row = robot.nearest(keyscan.stamp)
+            if abs(robot.stamps[row] - keyscan.stamp) > SAME_STAMP_S:
+                raise SourceError(f"{name}: the trajectory of {packet.robot} has no pose at {keyscan.stamp:.6f} s")
+            keyscans.append(keyscan)
+            poses.append(robot.T_map_base[row])
     if not keyscans:
         raise SourceError(f"{name}: the mission has no keyscan of map {map_index}; nothing to compare")
-    stamps = {name: np.argsort(robot.stamps, kind="stable") for name, robot in members.items()}
-    for keyscan in keyscans:
-        robot, order = members[keyscan.id.robot], stamps[keyscan.id.robot]
-        sorted_stamps = robot.stamps[order]
-        k = min(int(np.searchsorted(sorted_stamps, keyscan.stamp - SAME_STAMP_S)), len(order) - 1)
-        if k < 0 or abs(sorted_stamps[k] - keyscan.stamp) > SAME_STAMP_S:
-            raise SourceError(f"{name}: the trajectory of {keyscan.id.robot} has no pose at {keyscan.stamp:.6f} s")
-        poses.append(robot.T_map_base[order[k]])
-    return _Seen(keyscans, np.array(poses).reshape(-1, 3), lasers)
+    return _Seen(keyscans, np.array(poses), lasers)
 
 
 def _period_at(option: str, text: str, periods: Sequence[Period]) -> int:

@@ -421,20 +421,18 @@ class MissionStore:
         return tracks
 
     def traffic(self) -> Ledger:
-        """Traffic of accepted packets by label, and of refused ones."""
-        groups = "robot, kind, channel, refusal IS NULL"
+        """Traffic of accepted packets."""
+        groups = "robot, kind, channel"
         statement = (
             f"SELECT {groups}, count(*), CAST(sum(length(data)) AS BIGINT) FROM packets"
-            f" GROUP BY {groups} ORDER BY {groups}"
+            f" WHERE refusal IS NULL GROUP BY {groups} ORDER BY {groups}"
         )
-        accepted: dict[Label, Traffic] = {}
-        refused = Traffic()
-        for robot, kind, channel, counts, packets, size in self._database.rows(statement):
-            if counts:
-                accepted[Label(robot, PacketKind(kind), channel and Channel(channel))] = Traffic(packets, size)
-            else:
-                refused += Traffic(packets, size)
-        return Ledger(accepted, refused)
+        return Ledger(
+            {
+                Label(robot, PacketKind(kind), channel and Channel(channel)): Traffic(packets, size)
+                for robot, kind, channel, packets, size in self._database.rows(statement)
+            }
+        )
 
     def traffic_since(
         self, after: int, limit: int

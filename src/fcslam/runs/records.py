@@ -33,6 +33,10 @@ class RobotTrajectory:
         """The poses with all degrees of freedom that the map has, shape (N, 3) or (N, 7)."""
         return self.T_map_base if self.T_map_base_6d is None else self.T_map_base_6d
 
+    def nearest(self, stamp: float) -> int:
+        """Row of the scan whose stamp is nearest; there is at least one scan."""
+        return int(np.argmin(np.abs(self.stamps - stamp)))
+
     @property
     def path_length_m(self) -> float:
         """Length of the polygon through the positions."""

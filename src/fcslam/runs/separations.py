@@ -4,8 +4,6 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass, replace
 from itertools import combinations
 
-import numpy as np
-
 from fcslam.records import ClosureStatus, Reason, ReasonCode
 from fcslam.runs.records import ClosureRow, RunTables
 
@@ -98,7 +96,7 @@ def _end_in(run: RunTables, closure: ClosureRow, robots: tuple[str, ...]) -> tup
     ends = ((closure.robot_i, closure.stamp_i), (closure.robot_j, closure.stamp_j))
     robot, stamp = next(end for end in ends if end[0] in robots)
     path = run.trajectories[robot]
-    x, y, _ = path.T_map_base[int(np.argmin(np.abs(path.stamps - stamp)))].tolist()
+    x, y, _ = path.T_map_base[path.nearest(stamp)].tolist()
     return x, y
 
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final, NamedTuple
 
-import numpy as np
-
 from fcslam.errors import InputError
 from fcslam.graph.evidence import MapFit, refutation
 from fcslam.metrics.trajectory import find_jumps
@@ -198,7 +196,7 @@ def _centimetres(length_m: float) -> str:
 
 
 def _at(trajectory: RobotTrajectory, stamp: float) -> Point:
-    x, y, _ = trajectory.T_map_base[int(np.argmin(np.abs(trajectory.stamps - stamp)))].tolist()
+    x, y, _ = trajectory.T_map_base[trajectory.nearest(stamp)].tolist()
     return round(x, 2), round(y, 2)
 
 

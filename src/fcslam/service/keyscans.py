@@ -36,7 +36,7 @@ def live_pose(store: MissionStore, robot: str, epoch: int, drawn: RobotTrajector
     if not anchors:
         return last
     anchor = anchors[0]
-    pose, group = poses[int(np.argmin(np.abs(drawn.stamps - anchor.stamp)))], group_of(last)
+    pose, group = poses[drawn.nearest(anchor.stamp)], group_of(last)
     number = moved = anchor.id.number
     for step in store.constraints_since(robot, epoch, anchor.stamp):
         if step.kind is ConstraintKind.ODOMETRY and (step.i, step.j) == (moved, moved + 1):
@@ -77,7 +77,7 @@ def _submap(store: MissionStore, run: Run, session: str, stamp: float) -> FloatA
         raise InputError(f"the mission holds no keyscans of {session}")
     scans = []
     for keyscan in store.keyscans_near(robot, epoch, stamp, KEYSCANS):
-        nearest = int(np.argmin(np.abs(trajectory.stamps - keyscan.stamp)))
+        nearest = trajectory.nearest(keyscan.stamp)
         if abs(trajectory.stamps[nearest] - keyscan.stamp) < SAME_S:
             points = keyscan_points(keyscan, hello.lasers).thinned(SPACING_M).points
             scans.append((keyscan.stamp, trajectory.T_map_base[nearest], points))

@@ -1,1 +1,1 @@
-"""Files that are whole or not there, and SQLite databases."""
+"""Files that are whole or not there, databases of SQLite and PostgreSQL, and the state of a program as a file."""

@@ -24,8 +24,6 @@ class Ledger:
 
     accepted: dict[Label, Traffic] = field(default_factory=dict)
     """By robot, kind and, for places, channel; the kind determines the direction."""
-    refused: Traffic = Traffic()
-    """Traffic that was refused; its sender is not known."""
 
     def accept(self, label: Label, size: int) -> None:
         """Count a packet of ``size`` bytes that was accepted."""
