@@ -173,6 +173,28 @@ WRONG = [
             ("--path-length=-inf", "inf: is not a finite number"),
         )
     ),
+    # Names that no file can have
+    *(
+        (f"{command} {{long}} {more}", "xxx", "")
+        for command, more in (
+            ("show", ""),
+            ("show run --html", ""),
+            ("evaluate quality", ""),
+            ("evaluate fleet", ""),
+            ("map --onto", ""),
+            ("edit list", ""),
+            ("edit veto", "a b"),
+            ("edit erase", "'0,0 1,1'"),
+            ("localize r.log -o out --map", ""),
+            ("tools changes", ""),
+            ("tools extract", ""),
+            ("serve --data", ""),
+            ("map r.log -o", ""),
+            ("info", ""),
+            ("play r.log --server {url} --state", ""),
+            ("record r.log -o", ""),
+        )
+    ),
     # Words
     ("mapp r.log", "No such command 'mapp'. Did you mean 'map'?", "map r.log"),
     ("help", "(`fcslam -h` shows what there is)", "-h"),
@@ -227,6 +249,7 @@ def test_a_wrong_command_is_one_line_whose_remedy_works(
     before = times_of(place)
     with serving(FakeCloud(correction=4)) as cloud, socket.create_server(("127.0.0.1", 0)) as taken:
         names = {"url": cloud.url, "host": cloud.url.removeprefix("http://"), "port": taken.getsockname()[1]}
+        names["long"] = 300 * "x"
         line = refused(*shlex.split(command.format(**names)))
         assert says in line
         named = [words for words in line.split("`")[1::2] if words.startswith("fcslam ") and not words.endswith(" -h")]

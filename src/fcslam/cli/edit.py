@@ -1,6 +1,7 @@
 """`fcslam edit`: corrections of a mission by hand. Each is a line of a log, counts in later maps, and can be undone."""
 
 import getpass
+import os
 import re
 import time
 from collections.abc import Callable
@@ -240,7 +241,7 @@ def _decide(mission: Path, decision: "Veto | Pin") -> None:
     from fcslam.mission.map_edits import check_closure
     from fcslam.runs import open_run
 
-    if mission.is_dir():
+    if os.path.isdir(mission):
         check_closure(open_run(mission), decision)
     _append(mission, decision)
 
@@ -262,7 +263,7 @@ def _opened(folder: Path) -> "tuple[Run, SavedMission]":
     from fcslam.mission.mission_file import read_mission
     from fcslam.runs import open_run
 
-    if folder.is_file():
+    if os.path.isfile(folder):
         raise InputError(f"{folder}: give the run folder; coordinates are read in its map")
     return open_run(folder), read_mission(folder)
 

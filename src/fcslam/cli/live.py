@@ -98,13 +98,13 @@ def drive_live(
         heard = ", ".join((*topics.scans, topics.odometry or topics.transforms[0]))
         notify(f"{robot.name}: reads {heard}; Ctrl-C ends the drive and writes {output}")
         with stopping(node.stop):  # also while the run is written: a late SIGTERM must not lose it
-            process = None
-            if learning is not None and not isinstance(robot, LocalizedRobot):
+            if learning is None or isinstance(robot, LocalizedRobot):
+                failure = _drive(node, pose_watch(notify, lambda _: None))
+            else:
                 from fcslam.learning.federated.learning_process import LearningProcess
 
-                process = LearningProcess(learning, robot.name, notify)
-            with standstill_learning(process, robot) as follow:
-                failure = _drive(node, pose_watch(notify, follow))
+                with standstill_learning(LearningProcess(learning, robot.name, notify), robot) as follow:
+                    failure = _drive(node, pose_watch(notify, follow))
             if not node.scans:
                 notify("no scan was mapped; nothing is written")
                 return
@@ -143,16 +143,10 @@ def _finish(robot: "Robot | LocalizedRobot", notify: Callable[[str], None]) -> F
 
 
 @contextmanager
-def standstill_learning(
-    learning: "LearningProcess | None", robot: "Robot | LocalizedRobot"
-) -> "Iterator[Callable[[RobotPose], None]]":
-    """Let a process learn while its robot stands still, if there is one; gives what follows the robot's poses."""
+def standstill_learning(learning: "LearningProcess", robot: "Robot") -> "Iterator[Callable[[RobotPose], None]]":
+    """Let a process learn while its robot stands still; gives what follows the robot's poses."""
     from fcslam.learning.federated.learning_process import Standstill
-    from fcslam.live.localized_robot import LocalizedRobot
 
-    if learning is None or isinstance(robot, LocalizedRobot):
-        yield lambda _pose: None
-        return
     with closing(learning):
 
         def stop() -> None:

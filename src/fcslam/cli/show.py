@@ -41,7 +41,7 @@ def show(
     from fcslam.page.report import ShownRun, report_html
     from fcslam.storage.files import write_file
 
-    if html is not None and html.exists() and not (force and html.is_file()):
+    if html is not None and os.path.exists(html) and not (force and html.is_file()):
         raise InputError(f"{html}: exists; name a new file, or give --force to replace it")
     _check(run)
     with ShownRun(run) as shown:

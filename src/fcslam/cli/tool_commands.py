@@ -1,5 +1,6 @@
 """Short commands of `fcslam tools`: configuration, changes of a building, features of images, credentials."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -76,7 +77,7 @@ def extract(
     onnx = OnnxConfig(weights=None if named else Path(detector), most_features=keypoints, scales=MATCHING_SCALES)
     finder = make_detector(kind, onnx)
     files = [path for path in find_files(images) if path.suffix != ".npz"]  # an earlier output may be among them
-    root = images.parent if images.is_file() else images
+    root = images.parent if os.path.isfile(images) else images
     output = output or new_folder(FEATURES)
     console, done, empty = notices(), 0, 0
     longest_side_px = 2048  # of larger images, which are shrunk

@@ -4,6 +4,7 @@ Arrays: ``keypoints`` (N, 2) float32, x y in pixels of the image, (0, 0) the cen
 float32; ``descriptors`` (N, 32) uint8, the bits packed; ``image_size`` (2,), width and height.
 """
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -48,7 +49,9 @@ def write_features(path: Path, features: ImageFeatures, image_size: tuple[int, i
 
 def find_files(images: Path) -> list[Path]:
     """Return the file itself, or all files in the folder and its subfolders, sorted."""
-    files = [images] if images.is_file() else sorted(path for path in images.rglob("*") if path.is_file())
+    if os.path.isfile(images):
+        return [images]
+    files = sorted(path for path in images.rglob("*") if path.is_file()) if os.path.isdir(images) else []
     if not files:
         raise FeatureError(f"{images}: no file there; name an image or a folder of images")
     return files

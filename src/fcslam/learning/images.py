@@ -1,5 +1,6 @@
 """Training images, from any folder tree."""
 
+import os
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -37,7 +38,7 @@ def find_images(roots: Sequence[Path]) -> list[ImageFile]:
     """All image files in the folder trees, sorted by name."""
     found: dict[str, ImageFile] = {}
     for root in roots:
-        if not root.is_dir():
+        if not os.path.isdir(root):
             raise InputError(f"{root}: is not a folder; give a folder of images")
         base = root.resolve()
         files = [file for file in base.rglob("*") if file.suffix.lower() in SUFFIXES and file.is_file()]

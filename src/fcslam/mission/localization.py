@@ -4,6 +4,7 @@ sources -> robot (LiDAR tracking) -> localization in the map -> run folder
 """
 
 import csv
+import os
 from array import array
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -77,14 +78,14 @@ def read_finished(path: Path, floor: str = "") -> FinishedMap:
     """
     if path.suffix == Path(MISSION).suffix:
         return _mission_map(path, floor)
-    if (path / ROBOTS).is_file():
+    if os.path.isfile(path / ROBOTS):
         number, floor = _map_on(floor, _floors(path), path)
         points = path / f"{map_stem(number)}.ply"
         occupancy = replace(read_ros_map(path / f"{map_stem(number)}.yaml"), floor=floor)
         return FinishedMap(occupancy, read_bytes(points, path) if points.exists() else b"")
     if floor:
         raise SourceError(f"{path}: only run folders and mission files know floors; leave the floor out")
-    return FinishedMap(read_ros_map(path / MAP_YAML if path.is_dir() else path))
+    return FinishedMap(read_ros_map(path / MAP_YAML if os.path.isdir(path) else path))
 
 
 def pose_in_map(name: str, given: ArrayLike, occupancy: OccupancyMap) -> FloatArray:

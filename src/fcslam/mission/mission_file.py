@@ -167,8 +167,8 @@ def edit_mission(path: Path, contents: Sequence[Change | Undo], author: str, tim
 
 def mission_path(path: Path) -> Path:
     """The mission file that a user names by itself or by its run folder."""
-    path = path / MISSION if path.is_dir() else path
-    if not path.exists():
+    path = path / MISSION if os.path.isdir(path) else path
+    if not os.path.exists(path):
         raise SourceError(f"{path}: no such file; `fcslam map` writes {MISSION} into each run folder")
     with translate_errors(path), open_file(path) as file:
         start = file.read(len(_SQLITE))

@@ -149,8 +149,8 @@ def check_names(names: Iterable[str]) -> None:
 
 
 def is_run_folder(path: Path) -> bool:
-    """Whether ``path`` has the two entries that every run folder has."""
-    return (path / ROBOTS).is_file() and (path / TRAJECTORIES).is_dir()
+    """Whether ``path`` has the two entries that every run folder has. It may be one that no file can have."""
+    return os.path.isfile(path / ROBOTS) and os.path.isdir(path / TRAJECTORIES)
 
 
 def identity(folder: Path) -> tuple[int, int]:
@@ -174,7 +174,7 @@ def open_run(folder: StrPath, maps: bool = True) -> Run:
         InputError: the folder is missing, damaged, or not a run folder.
     """
     path = Path(folder)
-    if not path.exists():
+    if not os.path.exists(path):
         raise InputError(f"{path}: no such folder; check the path of the run")
     if not is_run_folder(path):
         raise InputError(f"{path}: not a run folder (it has no {ROBOTS} or no {TRAJECTORIES}/); `fcslam map` makes one")

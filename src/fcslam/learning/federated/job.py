@@ -1,5 +1,6 @@
 """A federated training job from the initial weights to the exported detector: over any transport, or in one process."""
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -118,7 +119,7 @@ def federate_locally(
     if twice:
         raise InputError(f"two folders are called {min(twice)}; a robot has its folder's name, so rename one")
     for folder in folders:
-        if not folder.is_dir():
+        if not os.path.isdir(folder):
             raise InputError(f"{folder}: is not a folder; give one folder of images for each robot")
     clients = {
         name: ImageClient(name, job.output / "robots" / name, job.device, on_step, folder)
