@@ -47,6 +47,7 @@ def run():
         config_yaml="seed: 1\n",
         pose_graph_g2o="VERTEX_SE2 0 0 0 0\n",
         map_files={"map.pgm": b"P5\x00\xff", "map_1.yaml": b"image: map_1.pgm\n"},
+        mission=b"packets",
         local_maps={
             t.robot: LocalMap(
                 t.robot, t.stamps, t.T_map_base[::-1], b"P5 \x00" + t.robot.encode(), f"image: {t.robot}.pgm\n"
@@ -75,7 +76,7 @@ def test_what_is_written_is_read_back(tmp_path, run):
     np.testing.assert_equal(astuple(back.joins[1]), astuple(run.joins[1]))
     assert back.metrics["uplink"] == run.metrics["uplink"]
     assert np.isnan(back.metrics["error"].value)
-    assert (back.config_yaml, back.pose_graph_g2o) == (run.config_yaml, run.pose_graph_g2o)
+    assert (back.config_yaml, back.pose_graph_g2o, back.mission) == (run.config_yaml, run.pose_graph_g2o, run.mission)
     assert dict(back.map_files) == dict(run.map_files)
     for given, read in zip(run.local_maps.values(), back.local_maps.values(), strict=True):
         assert (given.robot, given.pgm, given.yaml) == (read.robot, read.pgm, read.yaml)

@@ -1,12 +1,10 @@
 """`fcslam map` on bags, names for robots, and `fcslam record`."""
 
-import csv
-
 import numpy as np
 import pytest
 
 from fcslam.cli import main
-from fcslam.runs import read_tum
+from fcslam.runs import open_run, read_tum
 from fcslam.sources import open_source
 from tests.sources.bag_messages import drive, mounted, odom, save
 
@@ -15,11 +13,6 @@ pytestmark = pytest.mark.slow
 
 def run(*arguments):
     return main([*map(str, arguments)])
-
-
-def robots(folder):
-    with (folder / "robots.csv").open(newline="") as file:
-        return {row["robot"]: int(row["scans"]) for row in csv.DictReader(file)}
 
 
 @pytest.fixture
@@ -70,18 +63,20 @@ def test_choices_and_faults_are_said(tmp_path, capsys):
 # Names
 
 
-def test_names_tell_equal_files_apart(tmp_path, bag):
-    twin = save(tmp_path / "run1.mcap", drive(15))
-    assert run("map", f"anna={bag}", f"ben={twin}", "-o", tmp_path / "out") == 0
-    assert robots(tmp_path / "out") == {"anna": 40, "ben": 15}
-
-
-def test_a_file_with_an_equals_sign_is_a_file(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("files", "given", "robots"),
+    [
+        (("run1.bag", "run1.mcap"), ("anna=run1.bag", "ben=run1.mcap"), ["anna", "ben"]),
+        (("speed=2.bag", "speed=3.bag"), ("speed=2.bag", "slow=speed=3.bag"), ["speed_2", "slow"]),
+    ],
+)
+def test_names_tell_equal_files_apart_and_a_file_may_have_an_equals_sign(tmp_path, monkeypatch, files, given, robots):
     monkeypatch.chdir(tmp_path)
-    for name, scans in (("speed=2.bag", 40), ("speed=3.bag", 15)):
+    for name, scans in zip(files, (40, 15), strict=True):
         save(tmp_path / name, drive(scans))
-    assert run("map", "speed=2.bag", "slow=speed=3.bag", "-o", "out") == 0
-    assert robots(tmp_path / "out") == {"speed_2": 40, "slow": 15}
+    assert run("map", *given, "-o", "out") == 0
+    found = open_run("out").trajectories
+    assert {name: len(robot.stamps) for name, robot in found.items()} == dict(zip(robots, (40, 15), strict=True))
 
 
 # fcslam record, of a recording

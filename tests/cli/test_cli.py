@@ -53,9 +53,6 @@ def test_relations_table(run_and_relations, capsys, tmp_path):
     assert "0.2500" in out
     assert "1 of 2 relations used" in out
     assert (tmp_path / "table.csv").read_text().startswith("name,value,unit\ntranslation_error_mean,0.25,m\n")
-
-
-def test_relations_across_robots_with_the_parts_of_another_run(run_and_relations, capsys):
     run, relations = run_and_relations
     assert main(["evaluate", "relations", run, relations, "--across-robots", "--parts", run]) == 0
     assert "1 of 2 relations across robots used" in capsys.readouterr().out

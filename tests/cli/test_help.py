@@ -26,24 +26,15 @@ HEAVY = ["numpy", "pydantic", "fastapi", "httpx"]
 every_command = pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 
 
-def helped(words, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    assert main([*words, "--help"]) == 0
-    return [line.strip() for line in capsys.readouterr().out.splitlines()]
-
-
 @every_command
-def test_every_command_has_examples_each_whole_on_its_line(words, capsys, monkeypatch):
+def test_every_command_explains_its_options_and_has_examples_each_whole_on_its_line(words, capsys, monkeypatch):
+    assert [parameter.name for parameter in COMMANDS[words].params if not parameter.help] == []
     heading, *examples = COMMANDS[words].epilog.split("\n\n")
     assert heading == "Examples:"
-    assert examples
-    shown = helped(words, capsys, monkeypatch)
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main([*words, "--help"]) == 0
+    shown = [line.strip() for line in capsys.readouterr().out.splitlines()]
     assert shown[shown.index("Examples:") + 1 :][: len(examples)] == examples
-
-
-@every_command
-def test_every_example_runs_this_command(words):
-    _, *examples = COMMANDS[words].epilog.split("\n\n")
     assert [complaint(example, complete=True) for example in examples] == [""] * len(examples)
     called = [tuple(shlex.split(example)[1 : len(words) + 1]) for example in examples]
     assert words in called
@@ -52,12 +43,6 @@ def test_every_example_runs_this_command(words):
 def test_every_line_of_the_examples_is_of_a_command():
     shown = {example for command in COMMANDS.values() for example in command.epilog.split("\n\n")}
     assert set(EXAMPLES.splitlines()) - shown == set()
-
-
-@every_command
-def test_every_argument_and_option_is_explained(words):
-    unexplained = [parameter.name for parameter in COMMANDS[words].params if not parameter.help]
-    assert unexplained == []
 
 
 def test_commands_that_run_long_can_be_quiet():

@@ -5,7 +5,7 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.records import LaserScan, Odometry
-from fcslam.runs import open_run, read_tum
+from fcslam.runs import read_tum
 from fcslam.sources import open_source
 
 pytestmark = pytest.mark.slow
@@ -44,10 +44,3 @@ def test_a_scanner_is_as_asked_and_a_file_overrides_it(tmp_path):
         assert (scan.laser.beam_count, scan.laser.max_range_m, period_s) == pytest.approx(expected)
         assert any(isinstance(record, Odometry) for record in records) is not bool(options)
     assert "turn_rate_rad_s: 2.0" in (tmp_path / "other" / "simulation.yaml").read_text(encoding="utf-8")
-
-
-def test_a_simulated_fleet_is_mapped(simulated, tmp_path):
-    recordings = [str(simulated / name) for name in ("robot_1", "robot_2")]
-    assert main(["map", *recordings, "--output", str(tmp_path / "run")]) == 0
-    run = open_run(tmp_path / "run")
-    assert [trajectory.robot for trajectory in run.trajectories.values()] == ["robot_1", "robot_2"]

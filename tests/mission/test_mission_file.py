@@ -118,11 +118,6 @@ def test_the_settings_of_the_cloud_are_kept(logs, tmp_path):
     assert len({trajectory.map_index for trajectory in run.trajectories.values()}) == 2
 
 
-def test_a_mission_file_survives_the_run_folder(begun, tmp_path):
-    open_run(begun).save(tmp_path / "copy")
-    assert (tmp_path / "copy" / "mission.fcslam").read_bytes() == (begun / "mission.fcslam").read_bytes()
-
-
 def test_what_is_no_mission_file_is_told_in_one_line_and_stays_as_it_is(tmp_path):
     whole = GOLDEN.read_bytes()
     with pytest.raises(SourceError, match=r"nowhere: no such file; `fcslam map` writes mission.fcslam"):
