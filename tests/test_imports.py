@@ -73,9 +73,19 @@ def allowed(room: str) -> set[str]:
     return {"", room, *ROOMS[:ceiling]}
 
 
-def imported_modules(tree: ast.AST, package: list[str]) -> Iterator[str]:
-    """Every fcslam module imported anywhere in ``tree``, inside functions and type-checking blocks too."""
-    for node in ast.walk(tree):
+@pytest.fixture(scope="module")
+def statements() -> dict[Path, list[ast.stmt]]:
+    """The imports and classes of every module, also those inside functions, by its path in the package."""
+    kinds = ast.Import | ast.ImportFrom | ast.ClassDef
+    return {
+        path.relative_to(PACKAGE): [node for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, kinds)]
+        for path in sorted(PACKAGE.rglob("*.py"))
+    }
+
+
+def imported_modules(nodes: list[ast.stmt], package: list[str]) -> Iterator[str]:
+    """Every fcslam module that a module of ``package`` imports."""
+    for node in nodes:
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -88,11 +98,11 @@ def imported_modules(tree: ast.AST, package: list[str]) -> Iterator[str]:
         yield from (name for name in names if name.split(".")[0] == "fcslam" and not name.endswith(".__version__"))
 
 
-def violations(source: str, path: Path) -> list[str]:
+def violations(nodes: list[ast.stmt], path: Path) -> list[str]:
     parts = ["fcslam", *path.with_suffix("").parts]
     package = parts[:-1]
     room = room_of(".".join(package if path.name == "__init__.py" else parts))
-    seen = {room_of(module) for module in imported_modules(ast.parse(source), package)}
+    seen = {room_of(module) for module in imported_modules(nodes, package)}
     may = allowed(room) if room else {""}  # public names are imported late
     return [f"{path}: {room or 'fcslam'} imports {other}" for other in sorted(seen - may)]
 
@@ -102,64 +112,50 @@ def test_every_room_is_known():
     assert rooms - {"__init__"} <= set(ROOMS)
 
 
-def test_rooms_import_only_rooms_above():
-    found = [
-        violation
-        for path in sorted(PACKAGE.rglob("*.py"))
-        for violation in violations(path.read_text(encoding="utf-8"), path.relative_to(PACKAGE))
-    ]
-    assert found == []
+def test_rooms_import_only_rooms_above(statements):
+    assert [found for path, nodes in statements.items() for found in violations(nodes, path)] == []
 
 
-def import_graph() -> dict[str, set[str]]:
-    """The modules that each module imports, imports inside functions included."""
-    paths = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path for path in PACKAGE.rglob("*.py")}
-    modules = {name.removesuffix(".__init__"): path for name, path in paths.items()}
+def test_no_module_imports_itself_through_others(statements):
+    modules = {
+        ".".join(["fcslam", *path.with_suffix("").parts]).removesuffix(".__init__"): nodes
+        for path, nodes in statements.items()
+    }
     graph: dict[str, set[str]] = {}
-    for name, path in modules.items():
+    for name, nodes in modules.items():
         found = set()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in nodes:
             if isinstance(node, ast.Import):
                 found |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
                 inner = {f"{node.module}.{alias.name}" for alias in node.names}
                 found |= inner & modules.keys() or {node.module}
         graph[name] = found & modules.keys() - {name}
-    return graph
-
-
-def test_no_module_imports_itself_through_others():
-    graph = import_graph()
     assert len(graph["fcslam.mission.mission"]) > 5
     TopologicalSorter(graph).prepare()  # raises CycleError, which names the cycle
 
 
-def test_a_class_name_has_one_meaning():
-    names = [
-        node.name
-        for path in PACKAGE.rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
-    ]
-    assert [name for name, count in Counter(names).items() if count > 1] == []
+def test_a_class_name_has_one_meaning(statements):
+    classes = [node.name for nodes in statements.values() for node in nodes if isinstance(node, ast.ClassDef)]
+    assert [name for name, count in Counter(classes).items() if count > 1 and not name.startswith("_")] == []
+
+
+def test_one_module_starts_processes(statements):
+    starts = {"multiprocessing", "multiprocessing.process", "subprocess", "ProcessPoolExecutor", "fork", "Popen"}
+    found = {
+        path.as_posix()
+        for path, nodes in statements.items()
+        for node in nodes
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        and {getattr(node, "module", None), *(alias.name for alias in node.names)} & starts
+    }
+    assert found == {"processes.py"}
 
 
 def printed(program: list[str], folder: Path) -> str:
     """What the lines of a program print in a fresh interpreter."""
     command = [sys.executable, "-c", "\n".join(program)]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
-
-
-def test_one_module_starts_processes():
-    starts = {"multiprocessing", "multiprocessing.process", "subprocess", "ProcessPoolExecutor", "fork", "Popen"}
-    found = {
-        path.relative_to(PACKAGE).as_posix()
-        for path in PACKAGE.rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Import | ast.ImportFrom)
-        and {getattr(node, "module", None), *(alias.name for alias in node.names)} & starts
-    }
-    assert found == {"processes.py"}
 
 
 @pytest.mark.slow

@@ -86,11 +86,6 @@ def test_the_command_is_measured_and_its_failure_ends_the_script():
         common.run_fcslam("map", "no-such-log", "--output", "nowhere")
 
 
-@pytest.fixture
-def camera_detectors():
-    return load(FOLDER / "camera_detectors.py")
-
-
 def test_commands_of_reports_name_no_folder_of_one_machine():
     results = FOLDER / "results"
     commands = [

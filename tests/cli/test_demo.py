@@ -107,7 +107,7 @@ def test_without_the_simulator_one_line_says_what_to_install(tmp_path, capsys, m
 @pytest.mark.system
 def test_with_cameras(tmp_path):
     require_gl()
-    assert run_demo(tmp_path / "demo") == 0
+    assert run_demo(tmp_path / "demo", "--path-length", "4") == 0
     records = open_source(tmp_path / "demo" / "recordings" / "robot_1").records()
     assert sum(isinstance(record, CameraImage) for record in records) > 30
     figures = told(tmp_path / "demo")

@@ -8,7 +8,7 @@ from tests.learning.textures import textured
 torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 
 from fcslam.errors import InputError  # noqa: E402
-from fcslam.learning.labels import Teacher, fuse_keypoints, harris, peaks  # noqa: E402  # noqa: E402
+from fcslam.learning.labels import Teacher, fuse_keypoints, harris, peaks  # noqa: E402
 from fcslam.learning.network import KeypointNetwork  # noqa: E402
 from fcslam.learning.objective import negatives, shift_grid, teacher_bits  # noqa: E402
 from fcslam.learning.pairs import TrainingExample  # noqa: E402
