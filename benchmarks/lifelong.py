@@ -228,6 +228,7 @@ def against_truth(first: list[Any], now: Any, plain: Any, drivers: list[Any]) ->
 
     from fcslam.cloud.report import keyscan_track
     from fcslam.geometry import se2
+    from fcslam.lab.evaluation.ground_truth import labelled
     from fcslam.metrics.grid import grid_agreement
     from fcslam.metrics.trajectory import PositionErrors, align, position_errors
 
@@ -294,16 +295,6 @@ def within(points: Any, others: Any, reach_m: float) -> Any:
     from scipy.spatial import cKDTree
 
     return cKDTree(others).query(points, distance_upper_bound=reach_m + 1e-6)[0] <= reach_m + 1e-6
-
-
-def labelled(seen: Any) -> Any:
-    import numpy as np
-
-    from fcslam.maps.occupancy_map import Occupancy
-    from fcslam.metrics.grid import LabelledGrid
-
-    corner = np.array([*seen.origin_xy, 0.0])
-    return LabelledGrid(seen.cells == Occupancy.OCCUPIED, seen.cells == Occupancy.FREE, seen.resolution_m, corner)
 
 
 def mean(spent_s: list[float]) -> float:

@@ -12,10 +12,11 @@ share of new ones that the map has, and the share of old ones that it still has.
 import common
 import numpy as np
 from certificate import Simulated
-from lifelong import building_now, labelled, segment_points, within
+from lifelong import building_now, segment_points, within
 from worlds.changing import ChangingBuilding
 
 from fcslam.geometry import se2
+from fcslam.lab.evaluation.ground_truth import labelled
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.simulated_fleet import SimulationSettings, simulate_fleet
 from fcslam.maps.occupancy_map import parse_map

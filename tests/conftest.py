@@ -56,6 +56,8 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.attack)
         if SLOW & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
+    # Tests that wait for servers come first: at the end, the others are short enough to be shared by all workers.
+    items.sort(key=lambda item: item.get_closest_marker("system") is None)
 
 
 @pytest.fixture(scope="session", autouse=True)

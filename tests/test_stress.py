@@ -22,13 +22,13 @@ def run(script, *options):
 def test_the_same_map_whatever_happens(tmp_path):
     """A network that spares nothing."""
     scenarios = ["--scenarios", "all at once", "disk full"]
-    run("faults.py", *scenarios, "--robots", "2", "--path", "12", "--speed", "4", "--results", tmp_path)
+    run("faults.py", *scenarios, "--robots", "2", "--path", "8", "--speed", "4", "--results", tmp_path)
 
 
 @pytest.mark.attack
 def test_nothing_grows_while_robots_stand(tmp_path):
     """And connections break again and again."""
-    options = ["--hours", "3", "--minutes", "5", "--robots", "2", "--rate", "2", "--patrol", "0"]
+    options = ["--hours", "3", "--minutes", "3", "--robots", "2", "--rate", "2", "--patrol", "0"]
     run("soak.py", *options, "--results", tmp_path)
     report = tmp_path / "soak_standing.csv"
     first, _, last = ({name: float(value) for name, value in row.items()} for row in figures(report, "Hours"))

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from fcslam.errors import InputError
-from fcslam.lab.evaluation.ground_truth import TRUE_MAP, KnownPoses, known_poses, read_grid, truth_folder
+from fcslam.lab.evaluation.ground_truth import TRUE_MAP, KnownPoses, known_poses, labelled, truth_folder
+from fcslam.maps.ros_map import read_ros_map
 from fcslam.metrics.trajectory import align
 from fcslam.records import ClosureStatus, FloatArray
 from fcslam.runs import LOCAL, ClosureRow, LocalMap, Run, open_run
@@ -28,12 +29,12 @@ def fleet_charts(run: Path, truth: Path | None = None) -> FleetCharts:
         raise InputError(f"{run}: has no {LOCAL}/ with the robots' own maps; map the recordings again")
     return FleetCharts(
         local={
-            robot: Chart(read_grid(run / LOCAL / f"{robot}.yaml"), {robot: local.T_local_base})
+            robot: Chart(labelled(read_ros_map(run / LOCAL / f"{robot}.yaml")), {robot: local.T_local_base})
             for robot, local in opened.local_maps.items()
         },
         fused=_fused_chart(run, opened, known),
         building=Chart(
-            read_grid(folder / TRUE_MAP),
+            labelled(read_ros_map(folder / TRUE_MAP)),
             {robot: true.T_map_base[true.robots == k] for k, robot in enumerate(opened.local_maps)},
         ),
         matches=_matches(opened),
@@ -46,7 +47,7 @@ def _fused_chart(run: Path, opened: Run, known: KnownPoses) -> Chart:
     T_building_map = align(true.T_map_base[members], estimate.T_map_base[members])
     x, y, theta = T_building_map if np.isfinite(T_building_map).all() else IDENTITY
     trajectories = {t.robot: t.T_map_base for t in opened.trajectories.values() if t.map_index == 0}
-    return Chart(read_grid(run / "map.yaml"), trajectories, (float(x), float(y), float(theta)))
+    return Chart(labelled(read_ros_map(run / "map.yaml")), trajectories, (float(x), float(y), float(theta)))
 
 
 def _matches(run: Run) -> list[MatchedPlaces]:

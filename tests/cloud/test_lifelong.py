@@ -8,11 +8,11 @@ import pytest
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.report import keyscan_track, run_of
 from fcslam.cloud.settings import FleetConfig
+from fcslam.lab.evaluation.ground_truth import labelled
 from fcslam.lab.simulation.recording import true_map
 from fcslam.lidar.occupancy import OccupancyConfig
 from fcslam.maps.fusion import fuse
-from fcslam.maps.occupancy_map import Occupancy
-from fcslam.metrics.grid import LabelledGrid, grid_agreement
+from fcslam.metrics.grid import grid_agreement
 from fcslam.metrics.trajectory import align, position_errors
 from fcslam.places.matcher import MatcherConfig
 from fcslam.records import Channel, Place, Veto
@@ -139,11 +139,6 @@ def surfaces(result, drawn, count):
     fused = fuse(keyscans, poses, {robot.robot: robot.lasers for robot in robots}, OccupancyConfig())
     truth = true_map(replace(drawn, robots=drawn.robots[:count]))
     return errors, grid_agreement(labelled(fused), labelled(truth), T_truth_map).f1
-
-
-def labelled(seen):
-    corner = np.array([*seen.origin_xy, 0.0])
-    return LabelledGrid(seen.cells == Occupancy.OCCUPIED, seen.cells == Occupancy.FREE, seen.resolution_m, corner)
 
 
 def test_the_map_of_many_sessions_is_no_worse_than_that_of_few(packets, sessions, drawn):

@@ -10,7 +10,6 @@ from fcslam.cli import main
 from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.lab.evaluation.closures import ClosureScope
-from fcslam.lab.evaluation.ground_truth import read_grid
 from fcslam.lab.evaluation.report import EvaluatedJoin, evaluate_fleet, fleet_metrics
 from fcslam.records import Channel, ClosureStatus, Reason, ReasonCode, frozen
 from fcslam.runs import ClosureRow, Metric, RobotTrajectory, Run, write_tum
@@ -115,7 +114,7 @@ def test_a_run_that_is_the_truth_has_no_error(folder):
     assert max(report.within.translation.maximum, report.across.translation.maximum) < 1e-6
     found = report.agreement
     assert (found.precision, found.recall, found.f1) == (1.0, 1.0, 1.0)
-    assert found.free_iou == pytest.approx(1.0)
+    assert found.free_iou == pytest.approx(1.0, abs=0.005), "the map is turned, so it is drawn again along the axes"
     assert [score.uplink_bytes for score in report.robots] == [1000.0, 2000.0, 3000.0]
     assert report.places[LIDAR] == (4, 8000)
     assert np.isnan(report.places[CAMERA]).all()
@@ -253,8 +252,8 @@ def test_metrics_have_unique_names_and_json_no_nan(folder, capsys):
             "poses at only 0 of the 151 scans of 'r1'; is it the",
         ),
         ("r1/ground_truth.tum", "1 2 3\n", "not a TUM trajectory"),
-        ("ground_truth/map.pgm", "P5\n", "not a map of ROS map_server"),
-        ("ground_truth/map.yaml", "image: [1, 2", "not a map of ROS map_server"),
+        ("ground_truth/map.pgm", "P5\n", "not a map for ROS map_server"),
+        ("ground_truth/map.yaml", "image: [1, 2", "names no image"),
     ],
 )
 def test_bad_truth_is_one_line_and_exit_code_2(folder, capsys, file, content, message):
@@ -272,19 +271,3 @@ def test_a_run_without_robots_is_refused(folder):
     Run({}).save(folder)
     with pytest.raises(InputError, match="no robot"):
         evaluate_fleet(folder)
-
-
-def test_a_map_is_read_as_map_server_reads_it(tmp_path):
-    occupied, free = room()
-    for name, content in map_files("map", occupied, free, (1.0, 2.0, 0.5)).items():
-        (tmp_path / name).write_bytes(content)
-    grid = read_grid(tmp_path / "map.yaml")
-    assert np.array_equal(grid.occupied, occupied)
-    assert np.array_equal(grid.free, free)
-    lowest = np.zeros_like(occupied)
-    lowest[0, 0] = True
-    cos, sin = np.cos(0.5), np.sin(0.5)
-    assert grid.centres(lowest)[0] == pytest.approx((1.0 + 0.025 * (cos - sin), 2.0 + 0.025 * (cos + sin)))
-    negated = (tmp_path / "map.yaml").read_text().replace("negate: 0", "negate: 1")
-    (tmp_path / "map.yaml").write_text(negated)
-    assert np.array_equal(read_grid(tmp_path / "map.yaml").free, occupied)

@@ -6,20 +6,16 @@ The true poses of a robot are a TUM file, `<folder>/<robot>/ground_truth.tum` or
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from fcslam.config import one_line, parse_yaml
 from fcslam.errors import InputError
-from fcslam.features.detector import decode_grey
 from fcslam.lab.evaluation.relations import pose_table
-from fcslam.maps.occupancy_map import check_place
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.metrics.grid import LabelledGrid
 from fcslam.metrics.relations import PoseTable
 from fcslam.metrics.trajectory import interpolate
 from fcslam.records import FloatArray, frozen
 from fcslam.runs import RobotTrajectory, Run, read_tum
-from fcslam.untrusted import read_bytes, read_text
 
 GAP_S = 0.25
 """Longest gap between true poses that is interpolated."""
@@ -58,22 +54,10 @@ def known_poses(run: Run, folder: Path) -> KnownPoses:
     return found, PoseTable.of(stamps, true[known], robots)
 
 
-def read_grid(path: Path) -> LabelledGrid:
-    """Read a map in the format of ROS map_server from its YAML file."""
-    try:
-        meta = parse_yaml(read_text(path))
-        pixels = decode_grey(read_bytes(path.parent / meta["image"], path.parent))
-        if pixels is None:
-            raise ValueError(f"{one_line(str(meta['image']))} is not an image")
-        resolution_m, origin = float(meta["resolution"]), np.array(meta["origin"], dtype=np.float64)
-        occupied_over, free_under = float(meta["occupied_thresh"]), float(meta["free_thresh"])
-        check_place(resolution_m, *origin[:2].tolist())
-        if not (origin.shape == (3,) and np.isfinite(origin).all()):
-            raise ValueError("resolution or origin is wrong")
-    except (OSError, ValueError, TypeError, KeyError, cv2.error) as error:
-        raise InputError(f"{path}: not a map of ROS map_server ({error!r})") from error
-    occupancy = (pixels if meta.get("negate") else 255 - pixels)[::-1] / 255.0
-    return LabelledGrid(occupancy > occupied_over, occupancy < free_under, resolution_m, frozen(origin))
+def labelled(seen: OccupancyMap) -> LabelledGrid:
+    """The grid of a map, in the map's frame."""
+    corner = frozen(np.array([*seen.origin_xy, 0.0]))
+    return LabelledGrid(seen.cells == Occupancy.OCCUPIED, seen.cells == Occupancy.FREE, seen.resolution_m, corner)
 
 
 def _true_poses(trajectory: RobotTrajectory, stamps: FloatArray, folder: Path) -> FloatArray:

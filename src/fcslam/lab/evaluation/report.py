@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from fcslam.lab.evaluation.closures import FleetClosures, FleetClosureScore, score_closures
-from fcslam.lab.evaluation.ground_truth import TRUE_MAP, KnownPoses, known_poses, read_grid, truth_folder
+from fcslam.lab.evaluation.ground_truth import TRUE_MAP, KnownPoses, known_poses, labelled, truth_folder
 from fcslam.lab.evaluation.relations import relation_metrics
+from fcslam.maps.ros_map import read_ros_map
 from fcslam.metrics.closures import WRONG_DEG, WRONG_M, Mask, Recall
 from fcslam.metrics.grid import GridAgreement, grid_agreement
 from fcslam.metrics.relations import RelationErrors
@@ -151,7 +152,8 @@ def _joins(run: Run, known: KnownPoses) -> tuple[EvaluatedJoin, ...]:
 def _agreement(run: Path, folder: Path, alignments: Mapping[int, FloatArray]) -> GridAgreement | None:
     if not (folder / TRUE_MAP).is_file():
         return None
-    return grid_agreement(read_grid(run / "map.yaml"), read_grid(folder / TRUE_MAP), alignments[0])
+    drawn, true = (labelled(read_ros_map(place)) for place in (run / "map.yaml", folder / TRUE_MAP))
+    return grid_agreement(drawn, true, alignments[0])
 
 
 def _place_traffic(channel: Channel, figures: Mapping[str, float]) -> tuple[float, float]:
