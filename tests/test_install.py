@@ -11,10 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numba.core.caching import UserProvidedCacheLocator
 
 import fcslam
 from fcslam.cli import EXTRAS
+from tests.service.test_unit import lay_code
 from tools.dockerfile_in_root import steps
 
 pytestmark = pytest.mark.slow
@@ -71,18 +71,6 @@ def test_the_wheel_holds_every_file_of_the_package(installed):
     assert ours <= {path.relative_to(installed / "fcslam") for path in (installed / "fcslam").rglob("*")}
 
 
-def lend_compiled_code(installed, cache):
-    """Put our machine code into a user's cache, but of one module: to compile all takes half a minute."""
-    for source in Path(fcslam.__file__).parent.rglob("*.py"):
-        copy = installed / "fcslam" / source.relative_to(Path(fcslam.__file__).parent)
-        shutil.copystat(source, copy)  # numba knows a source by its time and size
-        folder = cache / UserProvidedCacheLocator.get_suitable_cache_subpath(str(copy))
-        folder.mkdir(parents=True, exist_ok=True)
-        for code in (source.parent / "__pycache__").glob(f"{source.stem}.*.nb[ic]"):
-            if source.stem != "quantisation":
-                shutil.copy(code, folder)
-
-
 @pytest.mark.system
 @needs_setpriv
 def test_an_unprivileged_user_maps_with_a_read_only_installation(installed, tmp_path):
@@ -90,7 +78,9 @@ def test_an_unprivileged_user_maps_with_a_read_only_installation(installed, tmp_
     asked = "import os, fcslam; print(fcslam.__file__, os.access(os.path.dirname(fcslam.__file__), os.W_OK))"
     said = run(*UNPRIVILEGED, sys.executable, "-c", asked, cwd=tmp_path, **user)
     assert said.split() == [str(installed / "fcslam" / "__init__.py"), "False"]
-    lend_compiled_code(installed, tmp_path / "cache")
+    for source in (ROOT / "src" / "fcslam").rglob("*.py"):  # numba knows a source by its time and size
+        shutil.copystat(source, installed / source.relative_to(ROOT / "src"))
+    lay_code(tmp_path / "cache", installed)
     fcslam_command = [*UNPRIVILEGED, sys.executable, "-m", "fcslam.cli"]
     run(*fcslam_command, "map", LOGS / "anna.clf.xz", "-o", "run", cwd=tmp_path, **user)
     assert set(fcslam.open_run(tmp_path / "run").trajectories) == {"anna"}

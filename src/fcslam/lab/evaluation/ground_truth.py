@@ -56,7 +56,7 @@ def known_poses(run: Run, folder: Path) -> KnownPoses:
 
 def labelled(seen: OccupancyMap) -> LabelledGrid:
     """The grid of a map, in the map's frame."""
-    corner = frozen(np.array([*seen.origin_xy, 0.0]))
+    corner: FloatArray = frozen(np.array([*seen.origin_xy, 0.0]))
     return LabelledGrid(seen.cells == Occupancy.OCCUPIED, seen.cells == Occupancy.FREE, seen.resolution_m, corner)
 
 
