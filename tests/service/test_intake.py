@@ -124,6 +124,17 @@ def test_of_many_sessions_the_later_ones_wait(desk):
         desk.take(hellos[4])
 
 
+def test_a_session_that_has_to_be_sent_again_for_lack_of_room_counts_once(desk):
+    small(desk, fleet=claiming(sessions_per_hour=2), most_waiting=3)
+    desk.take(*DATA[:5])
+    later = encode(replace(PACKETS[0], epoch=1, body=replace(PACKETS[0].body, epoch=1)))
+    for _ in range(3):
+        with pytest.raises(UnavailableError, match="5 packets have not taken effect yet"):
+            desk.take(later)
+    desk.store.progress(5, [])
+    assert desk.take(later) == [Acknowledgement("a", 1, 0)]
+
+
 def test_of_many_packets_the_later_ones_wait(desk):
     small(desk, fleet=claiming(packets_per_s=0.2))
     most = MAXIMUM_BATCH_PACKETS * MAXIMUM_PACKET_BYTES // PACKET_BYTES

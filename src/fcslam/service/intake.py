@@ -174,8 +174,8 @@ class Intake:
         refused = self._limit_refused(robot, bool(encoded))
         packets, refusal = _checked(robot, encoded, self._in_plane)
         numbers = [(packet.robot, packet.epoch, packet.sequence) for packet in packets]
-        self._limit_sessions(robot, {epoch for _, epoch, _ in numbers})
         self._make_room(robot, numbers)
+        self._limit_sessions(robot, {epoch for _, epoch, _ in numbers})
         try:
             self._store.put(packets, self._wall_clock())
         finally:
