@@ -61,7 +61,8 @@ def test_an_edit_survives_as_text(content):
     [
         ("rumour", "{}"), ("veto", "{"), ("veto", '{"robot_i": "a"}'), ("removal", '{"robot": "a", "epoch": "1"}'),
         ("veto", '{"robot_i": "a", "robot_j": "b", "stamps": [1, NaN]}'), ("undo", '{"number": null}'), ("undo", "[]"),
-        ("removal", '{"robot": "a", "epoch": -1}'), ("veto", '{"robot_i": "a", "robot_j": "b", "more": 1}'),
+        ("removal", '{"robot": "a", "epoch": -1}'), ("removal", f'{{"robot": "a", "epoch": {10**400}}}'),
+        ("veto", '{"robot_i": "a", "robot_j": "b", "more": 1}'),
         ("cut", '{"session": "a", "first_s": 2, "last_s": 2}'), ("pin", '{"robot_i": "a", "robot_j": "b"}'),
         ("cut", '{"session": "a b", "first_s": 1, "last_s": 2}'),
         ("closure", f'{{"robot_i": "a", "robot_j": "b", "stamp_j": 2, {T}, "tolerance": [0, 1]}}'),
@@ -298,7 +299,7 @@ def test_a_placement_moves_the_map_and_its_robots(scripted):
     for old, new in zip(before.robots, after.robots, strict=True):
         assert new.T_map_base == pytest.approx(se2.compose(T, old.T_map_base), abs=1e-9)
         assert new.T_local_base == pytest.approx(old.T_local_base)
-    for correction in (*after.corrections, *cloud.fleet.corrections()):
+    for correction in cloud.fleet.corrections():
         assert correction.T_map_odom == pytest.approx(T, abs=1e-6), "both robots start at the same place"
     assert after.graph.poses()[0] == pytest.approx(T)
 

@@ -7,8 +7,7 @@ import json
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict
 from itertools import chain
-from math import isfinite
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -161,8 +160,10 @@ def read_edit(kind: str, content: str) -> Change | Undo:
 
 def check_edit(content: Change | Undo) -> None:
     """Check the numbers and names of an edit."""
-    if not all(isfinite(number) for number in _numbers(asdict(content))):
-        raise InputError("a number of the edit is not finite")
+    try:
+        json.dumps(asdict(content), allow_nan=False)
+    except ValueError as error:
+        raise InputError("a number of the edit is not finite") from error
     unnamed = next((name for name in sessions_of(content) if not NAME.fullmatch(name)), None)
     if unnamed is not None:
         raise InputError(f"'{unnamed[:LONGEST_NAME]}' is not a name of a session")
@@ -215,10 +216,3 @@ def _check_region(region: MapRegion) -> None:
 def _check_coordinates(coordinates: Iterable[float]) -> None:
     if not all(abs(number) <= LARGEST_M for number in coordinates):  # false for NaN
         raise InputError(f"a coordinate is over {LARGEST_M:g} m")
-
-
-def _numbers(content: Any) -> Iterable[float]:
-    if isinstance(content, dict | list | tuple):
-        values = content.values() if isinstance(content, dict) else content
-        return chain.from_iterable(map(_numbers, values))
-    return (content,) if isinstance(content, float | int) else ()
