@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,8 @@ _CONSTRAINT_KINDS = {
     ConstraintKind.ODOMETRY: pb.CONSTRAINT_KIND_ODOMETRY,
     ConstraintKind.CLOSURE: pb.CONSTRAINT_KIND_CLOSURE,
 }
+_OF_POSE = "x_m", "y_m", "theta_rad"
+_OF_SPACE_POSE = "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"
 _OF_LASER = "beam_count", "angle_min_rad", "angle_increment_rad", "max_range_m"
 _OF_PLACE = "detector_version", "first", "last"
 _OF_FIX = "latitude_deg", "longitude_deg", "altitude_m", "sigma_m"
@@ -230,7 +233,7 @@ def _read_voxel_map(message: pb.VoxelMap, envelope: pb.Packet) -> VoxelMap:
         KeyscanId(envelope.robot, message.number),
         message.first,
         message.last,
-        _read_space_pose(message, "t_base_ground"),
+        _read_pose(message, "t_base_ground", _OF_SPACE_POSE),
         frozen(points, np.int16),
         frozen(origins.reshape(-1, 3), np.int16),
         frozen(seen_from, np.uint8),
@@ -287,28 +290,18 @@ def _values(source: object, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _write_pose(pose: FloatArray) -> pb.Pose:
-    x, y, theta = pose.tolist()
-    return pb.Pose(x_m=x, y_m=y, theta_rad=theta)
-
-
-def _read_pose(message: Message, field: str) -> FloatArray:
-    """Refuse an absent pose; it would read as the identity."""
-    if not message.HasField(field):
-        raise PacketError(f"{message.DESCRIPTOR.name.lower()}: {field} is missing")
-    pose: pb.Pose = getattr(message, field)
-    return frozen((pose.x_m, pose.y_m, pose.theta_rad))
+    return pb.Pose(**dict(zip(_OF_POSE, pose.tolist(), strict=True)))
 
 
 def _write_space_pose(pose: FloatArray) -> pb.SpacePose:
-    x, y, z, qx, qy, qz, qw = pose.tolist()
-    return pb.SpacePose(x_m=x, y_m=y, z_m=z, qx=qx, qy=qy, qz=qz, qw=qw)
+    return pb.SpacePose(**dict(zip(_OF_SPACE_POSE, pose.tolist(), strict=True)))
 
 
-def _read_space_pose(message: Message, field: str) -> FloatArray:
+def _read_pose(message: Message, field: str, of_pose: tuple[str, ...] = _OF_POSE) -> FloatArray:
+    """Refuse an absent pose; it would read as the identity."""
     if not message.HasField(field):
         raise PacketError(f"{message.DESCRIPTOR.name.lower()}: {field} is missing")
-    pose: pb.SpacePose = getattr(message, field)
-    return frozen((pose.x_m, pose.y_m, pose.z_m, pose.qx, pose.qy, pose.qz, pose.qw))
+    return frozen(attrgetter(*of_pose)(getattr(message, field)))
 
 
 def _pose_field(name: str, pose: FloatArray) -> dict[str, Any]:
@@ -321,7 +314,7 @@ def _read_pose_field(message: Message, name: str) -> FloatArray:
         return _read_pose(message, name)
     if message.HasField(name):
         raise PacketError(f"{message.DESCRIPTOR.name.lower()}: {name} is there twice")
-    return _read_space_pose(message, f"{name}_space")
+    return _read_pose(message, f"{name}_space", _OF_SPACE_POSE)
 
 
 def read_channel(code: int) -> Channel:

@@ -170,43 +170,36 @@ def _check_sweep(sweep: Sweep) -> None:
 
 
 def _check_information(information: FloatArray, what: str, freedom: int = 3) -> None:
-    """Refuse a matrix that is not symmetric or, as rounded and with a unit diagonal, not clearly positive definite."""
+    """Refuse a matrix that is not symmetric or, as rounded and with a unit diagonal, not clearly positive definite.
+
+    In plain numbers: arrays take longer for the many matrices (3, 3), which come one by one.
+    """
     _check_shape(information, (freedom, freedom), f"{what}: information")
-    if freedom != 3:
-        _check_large_information(information, what)
-        return
-    xx, xy, xt, yy, yt, tt = sent = pack_information(information)
+    sent = pack_information(information)
     _require(all(map(math.isfinite, sent)), f"{what}: information is not finite")
-    bounded = all(limits.MINIMUM_INFORMATION <= diagonal <= limits.MAXIMUM_INFORMATION for diagonal in (xx, yy, tt))
+    rounded, axes = unpack_information(sent).tolist(), range(freedom)
+    diagonal = [rounded[k][k] for k in axes]
+    bounded = all(limits.MINIMUM_INFORMATION <= number <= limits.MAXIMUM_INFORMATION for number in diagonal)
     _require(bounded, f"{what}: a diagonal element of information is not in [2^-20, 2^40]")
-    x, y, t = 1.0 / math.sqrt(xx), 1.0 / math.sqrt(yy), 1.0 / math.sqrt(tt)
-    scale = (x * x, x * y, x * t, y * x, y * y, y * t, t * x, t * y, t * t)
-    given = zip(information.ravel().tolist(), (xx, xy, xt, xy, yy, yt, xt, yt, tt), scale, strict=True)
-    symmetric = all(abs(number - rounded) * factor <= 1e-6 for number, rounded, factor in given)
-    _require(symmetric, f"{what}: information is not symmetric")
-    definite = _exceeds(limits.MINIMUM_CORRELATION_EIGENVALUE, xy * x * y, xt * x * t, yt * y * t)
-    _require(definite, f"{what}: information is not clearly positive definite")
+    scale = [1.0 / math.sqrt(number) for number in diagonal]
+    for given, row, scale_i in zip(information.tolist(), rounded, scale, strict=True):
+        symmetric = all(abs(given[k] - row[k]) * scale_i * scale[k] <= 1e-6 for k in axes)
+        _require(symmetric, f"{what}: information is not symmetric")
+    correlations = [[row[k] * scale_i * scale[k] for k in axes] for row, scale_i in zip(rounded, scale, strict=True)]
+    _require(_are_definite(correlations), f"{what}: information is not clearly positive definite")
 
 
-def _exceeds(limit: float, xy: float, xt: float, yt: float) -> bool:
-    """Whether a matrix (3, 3) with these correlations has no eigenvalue below ``limit`` < 1: without the limit on its
-    diagonal, all pivots of its elimination are positive. Without arrays it takes a tenth of the time."""
-    first = 1.0 - limit
-    second = first - xy * xy / first
-    rest = yt - xy * xt / first
-    return second > 0.0 and first - xt * xt / first - rest * rest / second > 0.0
-
-
-def _check_large_information(information: FloatArray, what: str) -> None:
-    sent = unpack_information(pack_information(information))
-    _require(bool(np.isfinite(sent).all()), f"{what}: information is not finite")
-    diagonal = sent.diagonal()
-    bounded = bool(((diagonal >= limits.MINIMUM_INFORMATION) & (diagonal <= limits.MAXIMUM_INFORMATION)).all())
-    _require(bounded, f"{what}: a diagonal element of information is not in [2^-20, 2^40]")
-    scale = 1.0 / np.sqrt(np.outer(diagonal, diagonal))
-    _require(bool((np.abs(information - sent) * scale <= 1e-6).all()), f"{what}: information is not symmetric")
-    definite = float(np.linalg.eigvalsh(sent * scale)[0]) >= limits.MINIMUM_CORRELATION_EIGENVALUE
-    _require(definite, f"{what}: information is not clearly positive definite")
+def _are_definite(correlations: list[list[float]]) -> bool:
+    """Whether a symmetric matrix has no eigenvalue below the limit: less that, all pivots of its elimination are
+    positive. Changes the matrix."""
+    for k, row in enumerate(correlations):
+        row[k] -= limits.MINIMUM_CORRELATION_EIGENVALUE
+        if not row[k] > 0.0:
+            return False
+        for below in correlations[k + 1 :]:
+            share = below[k] / row[k]
+            below[k:] = [number - share * above for number, above in zip(below[k:], row[k:], strict=True)]
+    return True
 
 
 def _check_voxel_map(local: VoxelMap) -> None:
