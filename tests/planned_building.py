@@ -102,7 +102,7 @@ def mapped(T_map_building=(3.0, -2.0, 0.6), scale=1.0, walls=WALLS, drift_rad=0.
         "anna", 0, frozen(np.arange(len(true), dtype=float)), keyscans, frozen(poses), frozen(poses),
         frozen(np.arange(len(true)), np.int64), (LASER,),
     )  # fmt: skip
-    return FleetResult((robot,), (), (), PoseGraph(poses, edges)), true
+    return FleetResult((robot,), (), PoseGraph(poses, edges)), true
 
 
 def off_m(placing, true):

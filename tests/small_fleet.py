@@ -61,9 +61,8 @@ def fingerprint(result: FleetResult) -> tuple[object, ...]:
         (c.i, c.j, c.similarity, c.T_i_j.tobytes(), c.information.tobytes(), c.status, c.reason, c.informative)
         for c in result.closures
     )
-    corrections = tuple((c.robot, c.version, c.map_index, c.T_map_odom.tobytes()) for c in result.corrections)
     edges = tuple((e.i, e.j, e.T_i_j.tobytes(), e.information.tobytes(), e.robust) for e in result.graph.edges)
-    return robots, closures, corrections, result.graph.poses().tobytes(), edges
+    return robots, closures, result.graph.poses().tobytes(), edges
 
 
 def contents(folder: Path) -> dict[Path, bytes]:

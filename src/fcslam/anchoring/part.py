@@ -57,14 +57,6 @@ def with_part(result: FleetResult, k: int, part: MapPart) -> FleetResult:
     T_i_j, information = edges.T_i_j.copy(), edges.information.copy()
     T_i_j[inside], information[inside] = own.T_i_j, own.information
     graph = PoseGraph.restored(poses, replace(edges, T_i_j=T_i_j, information=information))
-    T_after_before = {
-        name: se2.compose(robot.T_map_base[-1], se2.inverse(before[name].T_map_base[-1]))
-        for name, robot in after.items()
-    }
-    corrections = tuple(
-        replace(c, T_map_odom=frozen(se2.compose(T_after_before[c.robot], c.T_map_odom))) if c.robot in after else c
-        for c in result.corrections
-    )
     first = part.robots[0]
     T = se2.compose(first.T_map_base[0], se2.inverse(before[first.robot].T_map_base[0]))
     regions = tuple(
@@ -72,7 +64,7 @@ def with_part(result: FleetResult, k: int, part: MapPart) -> FleetResult:
         for region in result.regions
     )
     robots = tuple(after.get(robot.robot, robot) for robot in result.robots)
-    return replace(result, robots=robots, corrections=corrections, graph=graph, regions=regions)
+    return replace(result, robots=robots, graph=graph, regions=regions)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,7 +27,6 @@ class Cloud(FleetHost):
         super().__init__(
             CloudConfig(seed=seed, fleet=config, map=grid), lambda number: self._packets[number], verify_pairs
         )
-        self._times: dict[PacketNumber, float] = {}
         self._packets: dict[PacketNumber, Packet] = {}
         self._corrections: dict[str, SessionCorrection] = {}
         """The newest that was sent, by session."""
@@ -42,14 +41,14 @@ class Cloud(FleetHost):
         """Apply a packet as it was received, and those that waited for it; returns the replies to its sender."""
         number = PacketNumber(in_session(packet).robot, packet.sequence)
         if number not in self.log:
-            self._packets[number], self._times[number] = packet, packet.time
+            self._packets[number] = packet
         self.log.add(number, packet.time)
         refusal = None
         for ready in self.log.ready(number.session):
             try:
                 self.apply_next(ready, self._packets[ready])
             except PacketError as error:
-                del self._packets[ready], self._times[ready]
+                del self._packets[ready]
                 refusal = error if ready == number else refusal
         if refusal is not None:
             raise refusal
@@ -61,7 +60,7 @@ class Cloud(FleetHost):
 
     def finalize(self) -> FleetResult:
         """The result of all packets so far; it depends on their set alone."""
-        return self.conclude((time, number) for number, time in self._times.items())
+        return self.conclude((packet.time, number) for number, packet in self._packets.items())
 
     def _replies(self, packet: Packet, session: str) -> list[Packet]:
         robot, epoch = packet.robot, packet.epoch

@@ -108,12 +108,6 @@ class ClosureDecisions(Kept):
         """The sessions that share a map with this one, itself included."""
         return next(sessions for sessions in self.maps if session in sessions)
 
-    def counts(self) -> dict[str, int]:
-        """Accepted closures so far, by kind."""
-        closures = (entry.closure for entry in self.closures)
-        accepted = [c.i.robot != c.j.robot for c in closures if c.status is ClosureStatus.ACCEPTED]
-        return {"within robots": accepted.count(False), "between robots": accepted.count(True)}
-
     def add_local(self, closure: Constraint, tag: Tag | None = None) -> None:
         """Accept a closure within a robot's own map, which it found or a ``tag`` gives, unless it is vetoed."""
         i, j = KeyscanId(closure.robot, closure.i), KeyscanId(closure.robot, closure.j)

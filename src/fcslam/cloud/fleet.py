@@ -29,6 +29,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.pair_verification import VerifyPairs, verify_here
 from fcslam.records import (
     Change,
+    ClosureStatus,
     Constraint,
     ConstraintKind,
     Correction,
@@ -187,7 +188,7 @@ class Fleet:
             tuple(entry.closure for entry in entries),
             {pair: evidence for pair, evidence in self._decisions.joins.items() if pair <= set(sessions)},
         )
-        return conclude(self._sessions, self._graph, entries, fusion, self._decisions.version, self._decisions.changes)
+        return conclude(self._sessions, self._graph, entries, fusion, self._decisions.changes)
 
     def conclude(self) -> FleetResult:
         """Decide every closure from all evidence and collect the result; the fleet stays as it is."""
@@ -201,7 +202,7 @@ class Fleet:
         fusion = decisions.reevaluate(final=True)
         if self._config.fusion is not FusionStrategy.JOINT:
             fusion = fuse_rigidly(decisions.closures, fusion.T_local_base)
-        result = conclude(self._sessions, graph, decisions.closures, fusion, decisions.version, decisions.changes)
+        result = conclude(self._sessions, graph, decisions.closures, fusion, decisions.changes)
         return replace(result, sightings=self._tags.of(self._present()))
 
     def finalize(
@@ -242,7 +243,9 @@ class Fleet:
 
     def closure_counts(self) -> dict[str, int]:
         """Accepted closures so far, by kind."""
-        return self._decisions.counts()
+        entries = self._decisions.closures
+        accepted = [entry.is_between for entry in entries if entry.closure.status is ClosureStatus.ACCEPTED]
+        return {"within robots": accepted.count(False), "between robots": accepted.count(True)}
 
     def _present(self) -> list[str]:
         return [session for session in self._sessions.robots if not is_removed(session, self._decisions.changes)]

@@ -1,6 +1,6 @@
 """The pose graph of the whole fleet: every robot's keyscans, their constraints, the closures between robots."""
 
-from collections.abc import Collection, Container, Iterable, Mapping
+from collections.abc import Collection, Container, Mapping
 from dataclasses import fields
 
 import numpy as np
@@ -44,12 +44,6 @@ class JointGraph:
         """T_map_base (P,) of the keyscan in its robot's current map."""
         pose: FloatArray = self._poses.values[self.variable(keyscan)]
         return pose
-
-    def poses(self, keyscans: Iterable[KeyscanId]) -> FloatArray:
-        """T_map_base of the keyscans, each in its robot's current map, shape (N, P)."""
-        variables = [self._variables[robot].values[number] for robot, number in keyscans]
-        poses: FloatArray = self._poses.values[variables].reshape(-1, self.group.size)
-        return poses
 
     def trajectory(self, robot: str, numbers: NDArray[np.int64] | None = None) -> FloatArray:
         """T_map_base of the robot's keyscans, or of those with these numbers (N,), shape (N, P)."""

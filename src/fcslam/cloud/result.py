@@ -17,7 +17,6 @@ from fcslam.graph.pose_graph import PoseGraph
 from fcslam.records import (
     Change,
     ClosureStatus,
-    Correction,
     FloatArray,
     Keyscan,
     KeyscanFix,
@@ -74,12 +73,11 @@ class MappedRobot:
 
 @dataclass(frozen=True, slots=True)
 class FleetResult:
-    """Poses, decided closures, corrections and the pose graph."""
+    """Poses, decided closures and the pose graph."""
 
     robots: tuple[MappedRobot, ...]
     closures: tuple[LoopClosure, ...]
     """Between robots and within them."""
-    corrections: tuple[Correction, ...]
     graph: PoseGraph
     """All keyscans at their optimized poses, with the accepted constraints; of a fleet in space its projection."""
     regions: tuple[PlacedRegion, ...] = ()
@@ -123,7 +121,6 @@ def conclude(
     graph: JointGraph,
     closures: Iterable[ClosureEntry],
     fusion: Fusion,
-    version: int,
     changes: Sequence[Change],
 ) -> FleetResult:
     """Collect the result of the robots of ``fusion``, whose closures are those of the entries.
@@ -133,7 +130,6 @@ def conclude(
     group = graph.group
     fusion = _placed(fusion, sessions, changes, group)
     index = map_indices(fusion.maps)
-    names = [robot for robot in sessions.robots if robot in index]
     variables = graph.held_variables(fusion.T_map_base)
     robots = tuple(
         MappedRobot(
@@ -149,11 +145,8 @@ def conclude(
             tuple(fix for fix in sessions.fixes(robot) if not is_cut(robot, sessions.stamp(fix.id), changes)),
             None if group is SE2 else _space_path(robot, sessions, fusion, changes),
         )
-        for robot in names
-    )
-    corrections = tuple(
-        Correction(robot, version, index[robot], frozen(graph.T_map_odom(robot, fusion.T_map_base[robot][-1])))
-        for robot in names
+        for robot in sessions.robots
+        if robot in index
     )
     left_out = {
         entry.edge
@@ -163,9 +156,7 @@ def conclude(
     regions = placed_regions(index, sessions, lambda keyscan: group.to_plane(fusion.pose(keyscan)), changes)
     held = graph.held(fusion.T_map_base, left_out)
     space_graph = None if group is SE2 else held
-    return FleetResult(
-        robots, fusion.closures, corrections, held.to_plane(), regions, fusion.joins, space_graph=space_graph
-    )
+    return FleetResult(robots, fusion.closures, held.to_plane(), regions, fusion.joins, space_graph=space_graph)
 
 
 def _space_path(robot: str, sessions: SessionStore, fusion: Fusion, changes: Sequence[Change]) -> SpacePath:
