@@ -70,6 +70,29 @@ def held(registry):
     return {mission.name: mission.holder for mission in registry.missions() if mission.is_held}
 
 
+def test_of_two_looks_at_once_the_later_one_counts(registry, postgres):
+    """Requests look, too, such as the one that opens a mission."""
+    is_read, may_end = threading.Event(), threading.Event()
+
+    class Slow(Registry):
+        def missions(self):
+            found = super().missions()
+            if threading.current_thread() is not threading.main_thread():
+                is_read.set()
+                may_end.wait(0.5)
+            return found
+
+    one, _ = instance(postgres, "one", kind=Slow)
+    earlier = threading.Thread(target=one.look)
+    earlier.start()
+    is_read.wait()
+    wanted(registry, postgres, "new")
+    one.look()
+    may_end.set()
+    earlier.join()
+    assert list(one.known) == ["new"]
+
+
 def test_of_two_that_claim_at_once_each_mission_gets_one_worker(registry, postgres):
     for k in range(20):
         wanted(registry, postgres, f"m{k}")

@@ -49,6 +49,7 @@ class Instance:
         self._claims_from = clock()
         self.known: Mapping[str, KnownMission] = {}
         """All missions by name, as they were a moment ago."""
+        self._looking = threading.Lock()
         self.look()
         self._thread = threading.Thread(target=self._run, name=f"instance {name}", daemon=True)
 
@@ -75,14 +76,15 @@ class Instance:
         return next((worker for lease, worker in list(self._held.items()) if lease.mission == number), None)
 
     def look(self) -> None:
-        """See which missions there are now."""
-        before, self.known = self.known, {mission.name: mission for mission in self._registry.missions()}
-        for name, mission in self.known.items():
-            old = before.get(name)
-            if old is not None and mission.live > old.live:
-                self._listen("live", mission.live, name)
-            if old is not None and mission.finalized > old.finalized:
-                self._listen("finalized", mission.finalized, name)
+        """See which missions there are now; requests look, too, and an earlier look replaces no later one."""
+        with self._looking:
+            before, self.known = self.known, {mission.name: mission for mission in self._registry.missions()}
+            for name in before.keys() & self.known.keys():
+                old, mission = before[name], self.known[name]
+                if mission.live > old.live:
+                    self._listen("live", mission.live, name)
+                if mission.finalized > old.finalized:
+                    self._listen("finalized", mission.finalized, name)
 
     def _take_name(self) -> None:
         for _ in range(round(2.0 * self._registry.lease_s / LOOK_S)):  # one that was killed loses it in this time
