@@ -89,7 +89,7 @@ def shared_state(
             return Supervisor(folder.name, lambda: standby.start(task), lambda *_: None)
 
         missions: SharedMissions
-        events = EventStream(lambda: missions.open_mission.name)
+        events = EventStream(lambda: missions.open_name)
         missions = SharedMissions(data, config, server, name, int(limit), launch, events.publish, opened)
         return ServiceState(missions, authenticator, events, audit)
 

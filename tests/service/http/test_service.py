@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import re
+import threading
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from fcslam.errors import InputError
 from fcslam.features.detector import BUNDLED_NETWORK
 from fcslam.maps.palette import ROBOTS
 from fcslam.records import Channel, Correction, Keyscan
+from fcslam.service.http.state import ServiceState
 from fcslam.wire.limits import MAXIMUM_BATCH_BYTES, MAXIMUM_BATCH_PACKETS
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
 from fcslam.wire.packets import decode, encode, readdress
@@ -73,9 +75,13 @@ def test_a_robot_hears_what_is_stored_and_where_it_is(mapped):
     assert mapped.ask("GET", f"{API}/robots/a/state", "a").json()["next"] == {"0": len(A)}
 
 
-def test_nothing_that_may_wait_for_a_store_runs_between_the_requests(mapped):
+def test_nothing_that_may_wait_for_a_store_runs_between_the_requests(mapped, monkeypatch):
+    """To open the mission that a request is about may wait, too."""
+    opened_by, mission = set(), ServiceState.mission.fget
+    opening = property(lambda state: opened_by.add(threading.get_ident()) or mission(state))
+    monkeypatch.setattr(ServiceState, "mission", opening)
     assert mapped.ask("POST", f"{API}/finalize", "boss").status_code == 200
-    assert mapped.serving.ident not in mapped.state.mission.worker.notified_by
+    assert mapped.serving.ident not in mapped.state.mission.worker.notified_by | opened_by
 
 
 def test_a_robot_that_is_not_known_has_nothing_stored(desk):

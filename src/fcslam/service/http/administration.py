@@ -46,7 +46,7 @@ def administration_router(state: ServiceState) -> APIRouter:
         """Write the result of all packets that arrived as a run folder of the service; the response waits for it."""
         mission = await run_in_threadpool(lambda: state.mission)
         number = await run_in_threadpool(mission.ask_to_finalize)
-        while not state.closing and mission is state.mission:
+        while not state.closing and mission is await run_in_threadpool(lambda: state.mission):
             asked = await run_in_threadpool(mission.store.finalization, number)
             if asked.failure:
                 raise HTTPException(500, asked.failure)

@@ -15,6 +15,7 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Depends, HTTPException, Query, Request
 from fastapi import Path as PathParameter
 from fastapi.responses import Response, StreamingResponse
+from starlette.concurrency import run_in_threadpool
 
 import fcslam
 from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
@@ -288,6 +289,7 @@ def event_router(state: ViewerState) -> APIRouter:
 
         The stream ends when the service stops, or when the token is no longer valid.
         """
+        await run_in_threadpool(lambda: state.mission)  # refuses one that there is not, before the stream begins
         return StreamingResponse(lines(request), media_type=EVENTS)
 
     return router

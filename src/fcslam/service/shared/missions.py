@@ -190,13 +190,16 @@ class SharedMissions:
         return sorted(self._instance.known)
 
     @property
+    def open_name(self) -> str:
+        """Name of the mission that the present request names, or else of the open one; asks no store."""
+        known = self._instance.known
+        return NAMED.get() or next((name for name, mission in known.items() if mission.is_open), FIRST)
+
+    @property
     def open_mission(self) -> SharedMission:
-        """The mission that the present request names, or the open one."""
-        named = NAMED.get()
-        if named is None:
-            named = next((name for name, known in self._instance.known.items() if known.is_open), FIRST)
-        mission = self._opened.get(named)
-        return self._open_here(named) if mission is None else mission
+        """The mission of the ``open_name``."""
+        name = self.open_name
+        return self._opened.get(name) or self._open_here(name)
 
     def create(self, name: str) -> None:
         """As in ``Missions``."""
