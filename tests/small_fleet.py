@@ -7,14 +7,21 @@ from pathlib import Path
 import numpy as np
 
 from fcslam.cloud.cloud import Cloud
+from fcslam.cloud.fleet import Fleet
+from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.result import FleetResult
+from fcslam.cloud.sessions import in_session
+from fcslam.cloud.settings import FleetConfig
 from fcslam.lab.simulation.noise import LidarSettings
 from fcslam.lab.simulation.simulated_fleet import SimulatedFleet, SimulatedRobot, SimulationSettings, simulate_fleet
-from fcslam.records import SensorRecord
+from fcslam.records import Change, SensorRecord
 from fcslam.robot.backend_runner import Submit
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.storage.state_file import read_state, write_state
 from fcslam.wire.messages import Packet
 from fcslam.wire.packets import encode
+
+PLAIN = FleetConfig()
 
 
 @lru_cache
@@ -49,6 +56,15 @@ def feed(cloud: Cloud, packets: Iterable[Packet]) -> Cloud:
     for packet in packets:
         cloud.receive(encode(packet))
     return cloud
+
+
+def restored(
+    fleet: Fleet, packets: Iterable[Packet], path: Path, config: FleetConfig = PLAIN, changes: Sequence[Change] = ()
+) -> Fleet:
+    """The fleet by way of a file of its state."""
+    write_state(path, "test", fleet.state())
+    stored = {PacketNumber(in_session(packet).robot, packet.sequence): packet for packet in packets}
+    return Fleet.restored(config, 0, read_state(path, "test") or {}, stored.__getitem__, changes=changes)
 
 
 def fingerprint(result: FleetResult) -> tuple[object, ...]:

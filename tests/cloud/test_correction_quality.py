@@ -8,22 +8,17 @@ import pytest
 from fcslam.cloud.correction_quality import FRESH_M, HALVED_M, TIE_HALVED_M
 from fcslam.records import Correction, Veto
 from fcslam.wire.packets import decode, encode
-from tests.scripted import ALIAS, closures, rectangle, stream
+from tests.cloud.test_fleet import A, B, two_robots
+from tests.scripted import ALIAS, closures
 from tests.small_fleet import feed
 
 pytestmark = pytest.mark.slow
 
-POSES = rectangle()
-A, B = ("a", POSES), ("b", POSES)
 PAIRS = [(k, k) for k in range(0, 48, 4)]
 END = 60
 """Number of the last keyscan; they are 1 m apart."""
 EXPLAINED = 0.9
 """Of every scripted match."""
-
-
-def two_robots():
-    return [*stream(*A, start_s=0.0), *stream(*B, start_s=1000.0)]
 
 
 def qualities(cloud):

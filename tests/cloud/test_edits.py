@@ -7,8 +7,6 @@ import pytest
 
 from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.edits import check_undo, edit_json, in_force, kind_of, read_edit
-from fcslam.cloud.fleet import Fleet
-from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import InputError
 from fcslam.geometry import se2
@@ -26,16 +24,14 @@ from fcslam.records import (
     Undo,
     Veto,
 )
-from fcslam.storage.state_file import read_state, write_state
 from fcslam.wire.messages import Hello
+from tests.cloud.test_fleet import POSES, A, B, C, two_robots
+from tests.cloud.test_fleet import TRUE as PAIRS
 from tests.scripted import ALIAS, closures, rectangle, stream
-from tests.small_fleet import feed, fingerprint, in_order, map_of
+from tests.small_fleet import feed, fingerprint, in_order, map_of, restored
 
 pytestmark = pytest.mark.slow
 
-POSES = rectangle()
-A, B, C = ("a", POSES), ("b", POSES), ("c", POSES)
-PAIRS = [(0, 0), (8, 8), (16, 16), (24, 24), (32, 32), (40, 40)]
 CONTENTS = [
     Veto("a", "b"), Veto("a", "a", (1.5, 2.0)), Removal("b"), Removal("a", 3), Cut("a", 1.0, 2.0),
     Pin("a", "b", (1.0, 2.0)),
@@ -204,7 +200,7 @@ def test_no_closure_by_hand_joins_floors(scripted):
         assert map_of(feed(cloud, TWO).finalize()) == maps
 
 
-TWO = [*stream(*A, start_s=0.0), *stream(*B, start_s=1000.0)]
+TWO = two_robots()
 
 
 def test_a_pin_joins_maps_on_one_closure(scripted):
@@ -321,11 +317,7 @@ def test_edits_survive_in_the_state_of_a_fleet(scripted, tmp_path):
     fleet = feed(scripted(closures(A, B, PAIRS[:1])), TWO).fleet
     changes = [Pin("a", "b", (0.0, 1000.0)), ManualClosure("a", 9.0, "b", 1009.0, (0.0, 0.0, 0.0), (0.1, 0.1))]
     fleet.edit(changes)
-    write_state(tmp_path / "state", "test", fleet.state())
-    stored = {PacketNumber(packet.robot, packet.sequence): packet for packet in TWO}
-    again = Fleet.restored(
-        FleetConfig(), 0, read_state(tmp_path / "state", "test"), stored.__getitem__, changes=changes
-    )
+    again = restored(fleet, TWO, tmp_path / "state", changes=changes)
     assert fingerprint(again.estimate()) == fingerprint(fleet.estimate())
     assert fingerprint(again.conclude()) == fingerprint(fleet.conclude())
     again.edit([])

@@ -11,7 +11,7 @@ from fcslam.records import Constraint, ConstraintKind, Keyscan, KeyscanId, Place
 from fcslam.wire.messages import Hello
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet
-from tests.small_fleet import in_order, map_of
+from tests.small_fleet import feed, in_order, map_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.attack]
 
@@ -61,10 +61,7 @@ def named(body):
 
 
 def mapped(*streams):
-    cloud = Cloud(FleetConfig(), 0)
-    for packet in in_order(packet for stream in streams for packet in stream):
-        cloud.apply(packet)
-    return cloud.finalize()
+    return feed(Cloud(FleetConfig(), 0), in_order(packet for stream in streams for packet in stream)).finalize()
 
 
 @pytest.fixture(scope="module")

@@ -7,15 +7,13 @@ import pytest
 from byzantine import LIES, paths
 
 from fcslam.cloud.cloud import Cloud
-from fcslam.cloud.fleet import Fleet
-from fcslam.cloud.packet_log import PacketNumber
 from fcslam.cloud.settings import FleetConfig
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
 from fcslam.records import ClosureStatus, Constraint, Keyscan, KeyscanId, Place, ReasonCode, Removal, frozen
 from fcslam.wire.packets import decode, encode
 from tests import small_fleet
-from tests.small_fleet import fingerprint, in_order, map_of
+from tests.small_fleet import fingerprint, in_order, map_of, restored
 
 pytestmark = [pytest.mark.slow, pytest.mark.attack]
 
@@ -102,10 +100,9 @@ def test_a_copy_at_a_false_scale_of_a_percent_gets_a_map_of_its_own_too(honest, 
     assert np.hypot(*(se2.transform(n_point_alignment(wanted, xy), xy) - wanted).T).max() < 0.01
 
 
-def test_a_restored_fleet_keeps_robots_apart(packets, attacked):
-    stored = {PacketNumber(packet.robot, packet.sequence): packet for packet in packets}
-    restored = Fleet.restored(FleetConfig(), 0, attacked.fleet.state(), stored.__getitem__)
-    assert fingerprint(restored.conclude()) == fingerprint(attacked.fleet.conclude())
+def test_a_restored_fleet_keeps_robots_apart(packets, attacked, tmp_path):
+    again = restored(attacked.fleet, packets, tmp_path / "state")
+    assert fingerprint(again.conclude()) == fingerprint(attacked.fleet.conclude())
 
 
 @pytest.fixture(scope="module")

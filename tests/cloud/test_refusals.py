@@ -163,8 +163,6 @@ def test_a_duplicate_is_acknowledged_again(scripted):
 @pytest.mark.parametrize("changed", [{"keypoints": 0.0}, {"keypoints": 300.0}])
 def test_places_made_to_confuse_are_matched_without_harm(packets, changed):
     """Through the real matcher: all keypoints in one spot or far away, all descriptors equal."""
-    from fcslam.cloud.cloud import Cloud
-    from fcslam.cloud.settings import FleetConfig
 
     def poisoned(packet):
         if not hasattr(packet.body, "descriptors") or packet.robot != "robot_2":

@@ -7,14 +7,13 @@ import pytest
 
 from fcslam.cloud.fleet import Fleet
 from fcslam.cloud.packet_log import PacketLog, PacketNumber
-from fcslam.cloud.sessions import in_session
 from fcslam.cloud.settings import FleetConfig
 from fcslam.places.matcher import MatcherConfig
 from fcslam.places.vocabulary import VocabularyConfig
 from fcslam.storage.snapshot import from_state, to_state
 from fcslam.storage.state_file import read_state, write_state
 from tests import small_fleet
-from tests.small_fleet import fingerprint, in_order
+from tests.small_fleet import fingerprint, in_order, restored
 
 CONFIG = FleetConfig(
     solve_every=5,
@@ -45,13 +44,6 @@ def go_on(fleet, packets):
     return fleet
 
 
-def restarted(fleet, packets, path, changes=()):
-    """The fleet by way of a file."""
-    write_state(path, "test", fleet.state())
-    stored = {PacketNumber(in_session(packet).robot, packet.sequence): packet for packet in packets}
-    return Fleet.restored(CONFIG, 0, read_state(path, "test"), stored.__getitem__, changes=changes)
-
-
 def believed(fleet):
     corrections = [(c.robot, c.version, c.map_index, c.T_map_odom.tobytes(), c.quality) for c in fleet.corrections()]
     return fingerprint(fleet.estimate()), corrections, fleet.vocabularies(), fleet.closure_counts()
@@ -67,9 +59,9 @@ def test_restarts_anywhere_change_nothing(packets, uninterrupted, tmp_path):
     cuts = np.sort(np.random.default_rng(0).integers(0, len(packets), 3))
     fleet = Fleet(CONFIG, 0)
     for begin, end in zip([0, *cuts], [*cuts, len(packets)], strict=True):
-        fleet = restarted(go_on(fleet, packets[begin:end]), packets, tmp_path / "state")
+        fleet = restored(go_on(fleet, packets[begin:end]), packets, tmp_path / "state", CONFIG)
     assert believed(fleet) == believed(uninterrupted)
-    expected = restarted(uninterrupted, packets, tmp_path / "state")
+    expected = restored(uninterrupted, packets, tmp_path / "state", CONFIG)
     same(fleet, expected)
 
 
