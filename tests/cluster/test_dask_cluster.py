@@ -93,17 +93,11 @@ def test_killed_workers_and_a_scheduler_that_vanishes_change_nothing(tmp_path, p
 def test_a_worker_of_another_version_is_refused_by_name(tmp_path, pairs, expected, warnings_of):
     """At the start by one line, later by no work."""
     with Cluster(tmp_path) as cluster:
-        with (
-            pytest.raises(InputError, match=f"{cluster.address}: the cluster has no worker; start one: dask worker"),
-            verifying(cluster.address),
-        ):
-            pass
+        check_refused(cluster.address, f"{cluster.address}: the cluster has no worker; start one: dask worker")
         old = cluster.start_worker("old", preload="import fcslam; fcslam.__version__ = '0.0.9'")
         refused = wait_for(lambda: refusal(cluster))
         assert refused.startswith(f"{cluster.address}: worker 'old' (tcp://127.0.0.1:")
-        assert refused.endswith(
-            ") has fcslam 0.0.9, whose sources or libraries differ from fcslam 0.1.0 here; install the same ones there"
-        )
+        assert refused.endswith(f") has fcslam 0.0.9, {DIFFERENT}")
         old.kill()
 
         cluster.start_worker("good")
@@ -125,6 +119,11 @@ def credentials(folder):
     return [folder / "cluster" / name for name in ("ca.pem", "member.pem", "member.key")]
 
 
+def check_refused(address, reason):
+    with pytest.raises(InputError, match=reason), verifying(address):
+        pass
+
+
 def refusal(cluster):
     """Why the cluster cannot be used; None: it can."""
     try:
@@ -138,14 +137,9 @@ def test_a_cluster_that_is_not_there_is_told_in_one_line_or_waited_for(monkeypat
     from fcslam.cluster import verifying as dask_cluster
 
     monkeypatch.setattr(dask_cluster, "CONNECT_S", 0.5)
-    with (
-        pytest.raises(
-            InputError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers .*; start one: dask scheduler"
-        ),
-        verifying("tcp://127.0.0.1:9"),
-    ):
-        pass
-    with verifying("tcp://127.0.0.1:9", must_connect=False) as verify:
+    nobody = "tcp://127.0.0.1:9"
+    check_refused(nobody, f"{nobody}: no Dask scheduler answers .*; start one: dask scheduler")
+    with verifying(nobody, must_connect=False) as verify:
         assert written(verify(pairs[:5])) == written(verify_here(pairs[:5]))
         assert len(warnings_of()) == 1
 
@@ -165,17 +159,9 @@ def test_a_cluster_with_tls_takes_its_own_certificates_only(tmp_path, pairs, exp
     with Cluster(tmp_path, "tls", tuple(map(str, options))) as cluster:
         assert cluster.address.startswith("tls://")
         cluster.start_worker("one")
-        with (
-            configured(others),
-            pytest.raises(InputError, match="no Dask scheduler answers"),
-            verifying(cluster.address),
-        ):
-            pass
-        with (
-            pytest.raises(InputError, match=r"the certificates cannot be used|no Dask scheduler answers"),
-            verifying(cluster.address),
-        ):
-            pass
+        with configured(others):
+            check_refused(cluster.address, "no Dask scheduler answers")
+        check_refused(cluster.address, "the certificates cannot be used|no Dask scheduler answers")
         wait_for(lambda: "Starting established" in (tmp_path / "scheduler-0.log").read_text())
         time.sleep(1.0)
         with configured(ours), DaskCluster(cluster.address) as workers:

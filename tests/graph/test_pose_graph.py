@@ -40,22 +40,19 @@ def test_rounding_is_symmetrised_and_more_is_refused() -> None:
         edge(0, 1, rounded)
 
 
-@pytest.mark.parametrize("diagonal", [(1.0, 1.0, 0.0), (1.0, 1.0, -1.0), (0.0, 0.0, 0.0)])
-def test_information_must_be_positive_definite(diagonal: tuple[float, float, float]) -> None:
-    with pytest.raises(ValueError, match=r"edge 3 -> 4.*positive definite"):
-        edge(3, 4, np.diag(diagonal))
-
-
-@pytest.mark.parametrize("bad", [np.full((3, 3), np.nan), np.eye(2), np.full((3, 3), np.inf)])
-def test_information_must_be_finite_and_of_shape(bad: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="information must be finite"):
-        edge(0, 1, bad)
-
-
-@pytest.mark.parametrize(("i", "j"), [(1, 1), (-1, 0)])
-def test_an_edge_joins_two_variables(i: int, j: int) -> None:
-    with pytest.raises(ValueError, match="two different variables"):
-        edge(i, j)
+@pytest.mark.parametrize(
+    ("ends", "information", "reason"),
+    [
+        *(((3, 4), np.diag(bad), r"edge 3 -> 4.*positive definite") for bad in ((1, 1, 0), (1, 1, -1), (0, 0, 0))),
+        *(((0, 1), np.full((3, 3), bad), "information must be finite") for bad in (np.nan, np.inf)),
+        ((0, 1), np.eye(2), "information must be finite"),
+        ((1, 1), INFORMATION, "two different variables"),
+        ((-1, 0), INFORMATION, "two different variables"),
+    ],
+)
+def test_what_is_no_edge_is_refused(ends: tuple[int, int], information: np.ndarray, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        edge(*ends, information)
 
 
 def test_an_edge_names_variables_of_the_graph() -> None:

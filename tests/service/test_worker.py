@@ -80,7 +80,8 @@ class Cloud:
     def put(self, packets):
         self.store.put([stored(packet) for packet in packets], 0.0)
 
-    def work(self):
+    def work(self, after_s=0.0):
+        self.now += after_s
         while self.worker.step():
             pass
 
@@ -172,8 +173,7 @@ def test_a_worker_goes_on_from_its_snapshot_with_the_same_result(cloud):
     cut = (AT_ONCE + len(packets)) // 2
     cloud.put(packets[:cut])
     cloud.work()
-    cloud.now += SNAPSHOT_EVERY_S
-    cloud.work()
+    cloud.work(after_s=SNAPSHOT_EVERY_S)
     applied = []
     cloud.restart(hosts(lambda packet: applied.append((packet.robot, packet.sequence))))
     cloud.put(packets[cut:])
@@ -192,8 +192,7 @@ def test_in_space_a_restart_changes_no_byte_and_corrections_are_of_the_level_map
         for first, last in pairwise((0, *cuts, len(packets))):
             cloud.put(packets[first:last])
             cloud.work()
-            cloud.now += SNAPSHOT_EVERY_S
-            cloud.work()
+            cloud.work(after_s=SNAPSHOT_EVERY_S)
             cloud.restart()
         found.append(content(cloud.finalize()))
         live, told = open_run(cloud.folder.live), [cloud.store.correction(robot, 0).correction for robot in "ab"]
@@ -217,8 +216,7 @@ def test_when_robots_were_heard_survives_a_restart_and_a_replay_is_not_hearing_t
     packets = two_robots()
     cloud.put(packets[:-1])
     cloud.work()
-    cloud.now += SNAPSHOT_EVERY_S
-    cloud.work()
+    cloud.work(after_s=SNAPSHOT_EVERY_S)
     assert heard(cloud) == {"a": True, "b": True}
     cloud.restart()
     assert heard(cloud) == {"a": True, "b": True}
@@ -231,8 +229,7 @@ def test_when_robots_were_heard_survives_a_restart_and_a_replay_is_not_hearing_t
 
 def heard(cloud):
     """Whether it is known when each robot was heard, as the joint maps say."""
-    cloud.now += 60.0
-    cloud.work()
+    cloud.work(after_s=60.0)
     return {one.robot: one.heard_s > 0.0 for one in read_joint_maps(cloud.folder.joint_maps).sessions}
 
 
@@ -241,8 +238,7 @@ def test_a_snapshot_that_does_not_fit_is_ignored_with_one_line(cloud, tmp_path, 
     packets = two_robots()
     cloud.put(packets)
     expected = cloud.finalize()
-    cloud.now += 60.0
-    cloud.work()
+    cloud.work(after_s=60.0)
     assert cloud.folder.snapshot.exists()
     if fault == "damage":
         data = bytearray(cloud.folder.snapshot.read_bytes())
@@ -391,8 +387,7 @@ def test_a_packet_refused_while_it_waits_is_not_applied_after_a_restart(cloud):
     packets = stream("a", POSES, start_s=0.0)
     cloud.put([*packets[:-2], packets[-1]])
     cloud.work()
-    cloud.now += 60.0
-    cloud.work()
+    cloud.work(after_s=60.0)
     cloud.store.refuse([("a", 0, packets[-1].sequence, "by hand")])
     applied = []
     cloud.restart(hosts(applied.append))
@@ -460,13 +455,11 @@ def test_an_edit_and_its_undo_leave_what_would_have_been_without_them(cloud, cha
     edit = cloud.store.edit(change, "boss", 0.0)
     cloud.work()
     if restarts:
-        cloud.now += 60.0
-        cloud.work()
+        cloud.work(after_s=60.0)
         cloud.restart()
     cloud.put(packets[60:])
     run = cloud.finalize()
-    cloud.now += 1000.0
-    cloud.work()
+    cloud.work(after_s=1000.0)
     if isinstance(change, Removal):
         assert set(open_run(cloud.folder.live).trajectories) == {"a"}
         assert content(run) == expected("a")
@@ -480,8 +473,7 @@ def test_an_edit_and_its_undo_leave_what_would_have_been_without_them(cloud, cha
     run = cloud.finalize()
     assert content(run) == expected()
     assert {robot.floor for robot in run.trajectories.values()} == {""}
-    cloud.now += 1000.0
-    cloud.work()
+    cloud.work(after_s=1000.0)
     live = open_run(cloud.folder.live)
     assert {name: t.map_index for name, t in live.trajectories.items()} == {"a": 0, "b": 0}
     assert cloud.store.correction("b", 0) is not None
@@ -545,8 +537,7 @@ def test_the_live_run_follows_and_its_certificate_is_computed_seldom_or_when_map
     for part in np.array_split(np.arange(len(packets)), len(packets) // 4):
         cloud.put([packets[k] for k in part])
         for pause_s in (7.0, 1.0):
-            cloud.now += pause_s
-            cloud.work()
+            cloud.work(after_s=pause_s)
         live = open_run(cloud.folder.live)
         seen.append(sum(len(t.stamps) for t in live.trajectories.values()))
         if seen[-1]:
@@ -554,8 +545,7 @@ def test_the_live_run_follows_and_its_certificate_is_computed_seldom_or_when_map
     computed = [at for (at, one), (_, before) in zip(certificates[1:], certificates, strict=False) if one != before]
     assert 2 <= len(computed) < len(certificates) / 2
     assert sum(np.diff(computed) < QUALITY_EVERY_S - 8.0) <= 4, "b begins, and the maps join; none between"
-    cloud.now += QUALITY_EVERY_S
-    cloud.work()
+    cloud.work(after_s=QUALITY_EVERY_S)
     live = open_run(cloud.folder.live)
     assert set(json.loads(live.quality)) == {"0"}
     assert seen == sorted(seen)
@@ -571,13 +561,11 @@ def test_a_live_map_that_cannot_be_written_stops_nothing_and_comes_later(cloud):
     blocked = cloud.folder.path / "snapshots" / str(shown + 1)
     blocked.write_text("in the way")
     cloud.put(packets[20:])
-    cloud.now += 1000.0
-    cloud.work()
+    cloud.work(after_s=1000.0)
     assert cloud.store.applied() == len(packets)
     assert cloud.folder.live.resolve().name == str(shown)
     blocked.unlink()
-    cloud.now += 1000.0
-    cloud.work()
+    cloud.work(after_s=1000.0)
     assert sum(len(t.stamps) for t in open_run(cloud.folder.live).trajectories.values()) == 2 * len(POSES)
 
 
