@@ -6,7 +6,8 @@ from dataclasses import fields
 import gtsam
 import numpy as np
 
-from fcslam.geometry import se2
+from fcslam.geometry import se2, se3
+from fcslam.geometry.groups import SE2
 from fcslam.graph.least_squares import CAUCHY_WIDTH, Loss
 from fcslam.graph.optimizer import PosePrior
 from fcslam.graph.pose_graph import Edge, PoseGraph
@@ -61,32 +62,43 @@ def manhattan(
     return PoseGraph(np.array(drifted), edges), truth, np.arange(len(edges)) < true_count
 
 
+def gtsam_pose(T: np.ndarray) -> gtsam.Pose2 | gtsam.Pose3:
+    return gtsam.Pose2(*T) if len(T) == 3 else gtsam.Pose3(gtsam.Rot3(se3.rotation(T)), T[:3])
+
+
 def gtsam_problem(
     graph: PoseGraph, poses: np.ndarray, loss: Loss = Loss.SQUARED, priors: Sequence[PosePrior] = ()
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """GTSAM's factors and values; without priors, the first variable has one at its pose."""
     edges, problem, values, noise = graph.arrays(), gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel
+    kind, order = ("Pose2", [0, 1, 2]) if graph.group is SE2 else ("Pose3", [3, 4, 5, 0, 1, 2])  # turns come first
+    between, prior_of = getattr(gtsam, f"BetweenFactor{kind}"), getattr(gtsam, f"PriorFactor{kind}")
     for k, pose in enumerate(poses):
-        values.insert(k, gtsam.Pose2(*pose))
+        values.insert(k, gtsam_pose(pose))
     for i, j, T_i_j, information, robust in zip(*(getattr(edges, field.name) for field in fields(edges)), strict=True):
-        model = noise.Gaussian.Information(information, False)
+        model = noise.Gaussian.Information(information[np.ix_(order, order)], False)
         if robust and loss is Loss.CAUCHY:
             model = noise.Robust.Create(noise.mEstimator.Cauchy.Create(CAUCHY_WIDTH), model)
-        problem.push_back(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*T_i_j), model))
-    for prior in priors or [PosePrior(0, poses[0], 1e8 * np.eye(3))]:
+        problem.push_back(between(i, j, gtsam_pose(T_i_j), model))
+    for prior in priors:
         axes = gtsam.Pose2(*prior.pose).matrix() * ((1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (0.0, 0.0, 1.0))
         model = noise.Gaussian.Information(axes.T @ prior.information @ axes, False)
-        problem.push_back(gtsam.PriorFactorPose2(prior.variable, gtsam.Pose2(*prior.pose), model))
+        problem.push_back(prior_of(prior.variable, gtsam_pose(prior.pose), model))
+    if not priors:
+        exact = noise.Gaussian.Information(1e8 * np.eye(len(order)), False)
+        problem.push_back(prior_of(0, gtsam_pose(poses[0]), exact))
     return problem, values
 
 
 def gtsam_optimum(
     graph: PoseGraph, start: np.ndarray, loss: Loss = Loss.SQUARED, priors: Sequence[PosePrior] = ()
 ) -> tuple[np.ndarray, float]:
-    """The poses (N, 3) of GTSAM, and their cost."""
+    """The poses (N, P) of GTSAM, and their cost."""
     problem, values = gtsam_problem(graph, start, loss, priors)
     found = exactly_solved(problem, values)
-    return gtsam.utilities.extractPose2(found), problem.error(found)
+    if graph.group is SE2:
+        return gtsam.utilities.extractPose2(found), problem.error(found)
+    return np.array([se3.from_matrix(found.atPose3(k).matrix()) for k in range(len(graph))]), problem.error(found)
 
 
 def exactly_solved(problem: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
