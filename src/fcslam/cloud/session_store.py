@@ -268,10 +268,6 @@ class SessionStore:
         session = self._sessions[robot]
         return np.array([kept.stamp for kept in session.keyscans[: session.connected]])
 
-    def detector_versions(self, robot: str) -> Mapping[Channel, str]:
-        """The detectors of the robot now; none before its hello."""
-        return self._sessions[robot].hello.detector_versions if robot in self._sessions else {}
-
     def name_floors(self, floors: Mapping[str, str]) -> None:
         """Take over the floors that users gave, by session."""
         self._floors = dict(floors)
