@@ -1,5 +1,7 @@
 """Missions of one service: begun, opened, brought in, whatever the disk says."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from fcslam.cloud.settings import CloudConfig
@@ -66,6 +68,24 @@ def test_a_damaged_mission_is_refused_and_the_other_one_stays_open(service):
     path.write_bytes(content)
     missions.open("next")
     assert missions.open_mission.folder.name == "next"
+
+
+def test_an_export_is_of_the_mission_that_was_open_when_it_began(tmp_path):
+    """Another administrator may open another mission meanwhile."""
+    exported = []
+    seen = [
+        SimpleNamespace(name=name, store=SimpleNamespace(export=lambda _, name=name: exported.append(name)))
+        for name in ("first", "second")
+    ]
+
+    class Switching(Missions):
+        open_mission = property(lambda _: seen.pop(0))
+
+        def __init__(self):
+            self.root = tmp_path
+
+    Switching().export("first", tmp_path / "file")
+    assert exported == ["first"]
 
 
 @pytest.mark.parametrize("harm", ["gone", "empty"])

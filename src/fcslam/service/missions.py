@@ -164,9 +164,9 @@ class Missions:
 
     def export(self, name: str, path: Path) -> None:
         """Write a mission as one new file."""
-        folder = MissionFolder.of(self.root, name)
-        if name == self.open_mission.folder.name:
-            self.open_mission.store.export(path)
+        folder, mission = MissionFolder.of(self.root, name), self.open_mission
+        if name == mission.name:
+            mission.store.export(path)
             return
         if not folder.store.exists():
             raise UnknownMissionError(name, self.names)
