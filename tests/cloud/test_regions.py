@@ -79,11 +79,6 @@ def test_a_freed_region_is_free_and_of_two_regions_the_later_one_counts():
         assert np.array_equal(cells[~inside], MAP.cells[~inside])
 
 
-def test_only_an_erasure_erases():
-    for use in (RegionUse.AREA, RegionUse.KEEP_OUT):
-        assert with_regions(MAP, [region(use, TRIANGLE)]) is MAP
-
-
 def test_the_mask_of_nav2_has_the_cells_of_the_map():
     files = region_files(MAP, "map_1", [region(RegionUse.KEEP_OUT, TRIANGLE), region(RegionUse.KEEP_OUT, L_SHAPE)])
     assert sorted(files) == ["map_1_keepout.pgm", "map_1_keepout.yaml"]
@@ -107,5 +102,7 @@ def test_areas_are_closed_rings_in_metres():
     assert ring == [*map(list, TRIANGLE), list(TRIANGLE[0])]
 
 
-def test_where_nothing_is_drawn_there_is_no_file():
+def test_only_an_erasure_erases_and_it_needs_no_file():
+    for use in (RegionUse.AREA, RegionUse.KEEP_OUT):
+        assert with_regions(MAP, [region(use, TRIANGLE)]) is MAP
     assert region_files(MAP, "map", []) == region_files(MAP, "map", [region(RegionUse.ERASE, TRIANGLE)]) == {}

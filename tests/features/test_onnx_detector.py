@@ -51,14 +51,6 @@ def test_bits_are_the_signs_of_the_logits_at_a_cells_centre(tmp_path):
     assert np.array_equal(np.unpackbits(found.descriptors[0]), expected)
 
 
-def test_bits_are_the_signs_of_the_logits(weights):
-    image = np.random.default_rng(2).integers(0, 256, (61, 50), np.uint8)
-    detector = OnnxDetector(OnnxConfig(weights=weights))
-    bits, (found, logits) = detector.detect(image), detector.find(image)
-    assert np.array_equal(found.keypoints_px, bits.keypoints_px)
-    assert np.array_equal(np.packbits(logits >= 0, axis=1), bits.descriptors)
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (7, 300), (8, 8), (240, 320), (241, 317)])
 def test_images_of_any_size_give_keypoints_inside(weights, shape):
     image = np.random.default_rng(1).integers(0, 256, shape, np.uint8)

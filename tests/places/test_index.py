@@ -239,21 +239,21 @@ def test_a_place_is_stored_once_and_a_refused_one_not_at_all():
     check_stored(index, places)
 
 
-def trained_on(strategy, count, **others):
-    index = PlaceIndex[int](config(strategy, **others), np.random.default_rng(9))
-    trainings = []
-    for number, place in enumerate(random_places(np.random.default_rng(6), count)):
+@pytest.mark.parametrize(
+    ("strategy", "trainings"),
+    [
+        (Strategy.REBUILD, [(0, 0)] * 4 + [(5, 1), (6, 2), (6, 3), (6, 4), (6, 5)]),
+        (Strategy.WINDOWED, [(0, 0)] * 4 + [(5, 1)] * 5 + [(6, 2)] * 3),
+    ],
+)
+def test_a_vocabulary_is_trained_on_the_last_C_places(strategy, trainings):
+    """Algorithm 1 at every place after the first L; windowed as often as places come that were enough before."""
+    index = PlaceIndex[int](config(strategy, capacity=6), np.random.default_rng(9))
+    found = []
+    for number, place in enumerate(random_places(np.random.default_rng(6), len(trainings))):
         index.add(number, place)
-        trainings.append((index.trained_on or 0, index.version))
-    return trainings
-
-
-def test_algorithm_1_trains_at_every_place_after_the_first_L_on_the_last_C():
-    assert trained_on(Strategy.REBUILD, 9, capacity=6) == [(0, 0)] * 4 + [(5, 1), (6, 2), (6, 3), (6, 4), (6, 5)]
-
-
-def test_a_windowed_vocabulary_is_trained_as_often_as_places_come_that_were_enough_before():
-    assert trained_on(Strategy.WINDOWED, 12, capacity=6) == [(0, 0)] * 4 + [(5, 1)] * 5 + [(6, 2)] * 3
+        found.append((index.trained_on or 0, index.version))
+    assert found == trainings
 
 
 def test_the_window_is_the_last_C_places():

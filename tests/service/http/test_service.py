@@ -222,19 +222,6 @@ def edit(mapped, kind, content, who="boss"):
     return mapped.ask("POST", f"{API}/edits", who, json={"kind": kind, "content": content})
 
 
-def test_a_veto_parts_what_only_it_held_together(mapped):
-    assert edit(mapped, "veto", {"robot_i": "a", "robot_j": "b"}).status_code == 201
-    assert len(get(mapped, "maps").json()) == 2
-    both = {"robot_i": "a", "robot_j": "b"}
-    for wrong, status in (
-        ({"robot_i": "a", "robot_j": "x"}, 404), ({"robot_i": "a"}, 409), ({**both, "stamps": [1.0]}, 409),
-        ({**both, "stamps": [1.0, None]}, 409), ({"robot_i": "a", "robot_j": ""}, 409), ({**both, "more": 1}, 409),
-        ({**both, "stamps": [1.0, 1e9]}, 404),
-    ):  # fmt: skip
-        assert edit(mapped, "veto", wrong).status_code == status, wrong
-    assert "b+x" in edit(mapped, "veto", {"robot_i": "a", "robot_j": "b+x"}).text
-
-
 def test_who_has_the_first_poses_of_a_trajectory_gets_the_others_unless_those_moved(shown):
     path = "trajectories/a.tum"
     whole = get(shown, path)
@@ -296,6 +283,15 @@ def test_a_vetoed_closure_says_so_and_the_maps_come_apart_with_a_reason(mapped):
     assert "a has another map" in second
     (made,) = get(mapped, "edits").json()
     assert (made["kind"], made["author"], made["undone_by"]) == ("veto", "boss", None)
+    assert len(get(mapped, "maps").json()) == 2
+    both = {"robot_i": "a", "robot_j": "b"}
+    for wrong, status in (
+        ({"robot_i": "a", "robot_j": "x"}, 404), ({"robot_i": "a"}, 409), ({**both, "stamps": [1.0]}, 409),
+        ({**both, "stamps": [1.0, None]}, 409), ({"robot_i": "a", "robot_j": ""}, 409), ({**both, "more": 1}, 409),
+        ({**both, "stamps": [1.0, 1e9]}, 404),
+    ):  # fmt: skip
+        assert edit(mapped, "veto", wrong).status_code == status, wrong
+    assert "b+x" in edit(mapped, "veto", {"robot_i": "a", "robot_j": "b+x"}).text
 
 
 def test_a_removed_robot_leaves_the_map_and_comes_back(mapped):

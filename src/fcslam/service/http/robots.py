@@ -83,8 +83,8 @@ def robot_router(state: ServiceState) -> APIRouter:
     @router.get("/robots/{robot}/state", dependencies=as_robot, responses=refusals(507))
     def get_state(robot: Name) -> RobotState:
         """Where a robot continues after a restart, and which of its packets were refused."""
-        store = state.mission.store
-        sessions = state.mission.sessions(robot)
+        mission = state.mission
+        store, sessions = mission.store, mission.sessions(robot)
         newest = sessions[-1].epoch if sessions else None
         correction = None if newest is None else store.correction(robot, newest)
         return RobotState(
