@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,14 +69,8 @@ class _Session:
     """Numbers of the packets of voxel maps, by keyscan."""
 
 
-_KEPT: dict[str, Any] = {
-    "announced": set[tuple[Channel, str]],
-    "connected": int,
-    "T_odom_base": FloatArray | None,
-    "places": set[tuple[int, Channel, str]],
-    "spans": dict[tuple[int, Channel], tuple[int, int]],
-    "fixes": dict[int, KeyscanFix],
-    "voxel_maps": dict[int, int],
+_KEPT = {
+    name: kind for name, kind in get_type_hints(_Session).items() if name not in ("hello", "hello_sequence", "keyscans")
 }
 """What a state has of each session as it is."""
 

@@ -37,7 +37,7 @@ from fcslam.storage.state_file import State
 from fcslam.wire.limits import MAXIMUM_TAGS
 
 MOST_SENDERS = 10
-"""Robots, those that saw the tag last, whose newest session a new sighting is paired with."""
+"""Robots, those that came to the tag last, whose newest session a new sighting is paired with."""
 MOST_CLOSURES = 200
 """Closures by tags between two sessions: their cost grows with the square."""
 REVISIT_M = 10.0

@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 from fcslam.processes import Child, module_command
 
 LONGEST_PAUSE_S = 30.0
-"""Longest pause before another start. The first one is a second, and each one twice as long as that before; so is the
-first one after a worker that ran for longer than this.
-"""
+"""Longest pause before another start. The first one is a second, and each one twice as long as that before. After a
+worker that ran for longer than this, it is a second again."""
 READY = "ready"
 """The event by which a worker reports that it is ready."""
 PROGRESS = "progress"
