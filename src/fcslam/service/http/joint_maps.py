@@ -25,7 +25,7 @@ from fcslam.service.http.responses import file_of, refusals, unless_known
 from fcslam.service.http.robots import NETWORK, Name
 from fcslam.service.http.state import ServiceState
 from fcslam.service.joint_maps import Exploration, JointMaps, ServedJointMaps
-from fcslam.service.viewed_mission import run_of, viewed_run
+from fcslam.service.viewed_mission import viewed_run
 from fcslam.untrusted import read_bytes
 from fcslam.wire.fleet_replies import FleetReply, FrontierReply, MapFrontiers, QualityReply, TeammatePose
 
@@ -113,11 +113,10 @@ def joint_map_router(state: ServiceState) -> APIRouter:
     @router.get("/robots/{robot}/points", dependencies=as_reader, **file_of(NETWORK, is_tagged=True))
     def get_points(request: Request, robot: Name) -> Response:
         """The points of the map in space that a robot is in, as a PLY file that is as old as the live map."""
-        folder, sessions = state.mission.run_folder, run_of(state.mission).trajectories.values()
-        numbers = [one.map_index for one in sessions if robot_and_epoch(one.robot)[0] == robot]
-        if folder is None or not numbers:
+        folder = state.mission.run_folder
+        if folder is None or not (numbers := _maps_of(folder, robot)):
             raise HTTPException(404, f"robot '{robot}' is in no map yet")
-        file = folder / f"{map_stem(numbers[-1])}.ply"
+        file = folder / f"{map_stem(numbers.pop())}.ply"
         if not file.exists():
             raise HTTPException(404, f"the map of robot '{robot}' has no points in space yet")
         answer = unless_known(request, read_bytes(file, folder), NETWORK)
