@@ -113,7 +113,7 @@ class PlaceRecognition:
         stored = [self._places.get((key, session), _NO_PLACES) for session in sessions]
         by_arrival = np.argsort(np.concatenate(stored)[:, 1])
         poses = [self._graph.trajectory(session, rows[:, 0]) for session, rows in zip(sessions, stored, strict=True)]
-        positions = np.concatenate(poses)[by_arrival, :2]
+        positions = np.concatenate(poses)[by_arrival, : self._graph.group.axes]
         owners = np.repeat(np.arange(len(sessions)), [len(rows) for rows in stored])[by_arrival]
         numbers = np.concatenate(stored)[by_arrival, 0]
         surplus = surplus_places(positions, settings.nearby_m, settings.most_nearby)

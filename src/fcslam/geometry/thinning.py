@@ -13,7 +13,8 @@ def surplus_places(positions_m: FloatArray, side_m: float, most: int) -> NDArray
     Discs around the newest place would not do this: a moving robot would delete the places behind it.
 
     Args:
-        positions_m: shape (N, 2), x and y in ``map``, metres; the oldest place first, the newest last.
+        positions_m: shape (N, 2) in ``map``, metres, or (N, 3) in space, where squares are cubes; the oldest place
+            first, the newest last.
         side_m: side of the squares, metres. The origin of ``map`` is the centre of a square.
         most: places that a square may hold, 1 or more.
 
