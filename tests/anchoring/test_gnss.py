@@ -55,13 +55,18 @@ def fixed(result, fixes):
 
 
 def off_m(placing, true, T_earth_building):
-    """Distance of each pose from the truth, by latitude and longitude; a degree of latitude is 111.2 km."""
+    """Distance of each pose from the truth, by latitude and longitude."""
     (robot,), place = placing.result.robots, json.loads(placing.files["map_georeference.json"])
     T_earth_map = np.array((0.0, 0.0, np.radians(place["x_axis_from_east_deg"])))
+    return off_by(place, se2.compose(T_earth_map, robot.T_map_base), true, T_earth_building)
+
+
+def off_by(place, found, true, T_earth_building):
+    """Distance of each pose, of axes east and north, from the truth; a degree of latitude is 111.2 km."""
     expected = to_earth(se2.compose(np.array(T_earth_building), true)[:, :2])
     metres = 111_200.0 * np.array((1.0, np.cos(np.radians(ORIGIN[0]))))
-    found = se2.compose(T_earth_map, robot.T_map_base)[:, :2]
-    return np.hypot(*(found - ((expected - (place["latitude_deg"], place["longitude_deg"])) * metres)[:, ::-1]).T)
+    east_north = ((expected - (place["latitude_deg"], place["longitude_deg"])) * metres)[:, ::-1]
+    return np.hypot(*(found[:, :2] - east_north).T)
 
 
 @pytest.mark.parametrize("T_earth_building", [(35.0, -20.0, 0.7), (-300.0, 500.0, -2.0)])
@@ -203,10 +208,7 @@ def test_fixes_are_part_of_the_mission_and_place_it_again(tmp_path):
     assert place["ignored"] == 0
     assert first.map_files == again.map_files
     found = np.concatenate([each.T_map_base for each in first.trajectories.values()])
-    expected = to_earth(se2.compose(np.array(T), true)[:, :2])
-    metres = 111_200.0 * np.array((1.0, np.cos(np.radians(ORIGIN[0]))))
-    east_north = ((expected - (place["latitude_deg"], place["longitude_deg"])) * metres)[:, ::-1]
-    assert np.hypot(*(found[:, :2] - east_north).T).max() < 0.15
+    assert off_by(place, found, true, T).max() < 0.15
 
 
 def test_a_fix_is_sent_with_the_keyscan_of_the_scan_next_to_it():

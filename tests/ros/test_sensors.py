@@ -30,9 +30,9 @@ from tests.ros.ros_messages import (
     scan,
     transform,
 )
-from tests.sources.bag_messages import quaternion, save
+from tests.sources.bag_messages import save
 from tests.sources.clouds import PERIOD_S, VELODYNE, at_rest, cloud, depth_image, plan_ranges, rotation, spinning
-from tests.sources.test_bag_clouds import YAW, leaning_bag
+from tests.sources.test_bag_clouds import LEANING, drive
 from tests.sources.test_drivers import in_tf, late
 
 pytestmark = pytest.mark.slow
@@ -450,7 +450,7 @@ def played(path, **options):
     {
         "odometry in tf": (lambda path: save(path, in_tf()), ""),
         "a clock of its own": (lambda path: save(path, late(17.0)), "the clock of /odom is 17.0"),
-        "points that lean": (lambda path: leaning_bag(path, quaternion(YAW), roll=-0.5), "the floor in /points leans"),
+        "points that lean": (lambda path: save(path, drive(**LEANING, roll=-0.5)), "the floor in /points leans"),
     }.values(),
 )
 def test_a_live_robot_is_read_as_its_bag(make, words, tmp_path):

@@ -45,19 +45,21 @@ def pose_at(times):
 
 
 @cache
-def seen(stamp, columns=480):
+def seen(stamp, columns=480, rings=6, **leans):
     """The cloud of the turn that begins ``stamp`` seconds after the start."""
-    R = rotation(yaw=YAW)
-    return spinning(lambda times: pose_at(stamp + times), LIDAR, R, rings=6, columns=columns)
+    return spinning(lambda times: pose_at(stamp + times), LIDAR, rotation(yaw=YAW, **leans), rings, columns)
 
 
-def drive(seconds=2.0, every_s=0.1, layout=VELODYNE, body=None, ros1=False, columns=480):
-    """Odometry at 50 Hz and clouds of a turning scanner at 10 Hz; ``body``: points that it always sees, too."""
-    messages = [tf(START, "base_link", "lidar", LIDAR, quaternion(YAW), topic="/tf_static")]
+def drive(seconds=2.0, every_s=0.1, layout=VELODYNE, body=None, ros1=False, stated=(), **scanner):
+    """Odometry at 50 Hz and clouds of a turning scanner at 10 Hz; ``body``: points that it always sees, too.
+
+    ``stated`` is how it leans in tf, ``scanner`` how it does, and what it sees.
+    """
+    messages = [tf(START, "base_link", "lidar", LIDAR, quaternion(YAW, **dict(stated)), topic="/tf_static")]
     for t in np.arange(0.0, seconds + 0.5, 0.02):
         messages.append(odom(START + t, pose_at([t])[0], bag_time=START + t))
     for t in np.arange(0.1, seconds, every_s).round(3).tolist():
-        measured = seen(t, columns)
+        measured = seen(t, **scanner)
         if body is not None:
             points, times = np.vstack((measured.points, body)), np.append(measured.times, np.zeros(len(body)))
             measured = Measured(points, times)
@@ -284,21 +286,13 @@ def test_each_scan_has_its_own_limits(tmp_path):
     assert np.array_equal(records[-1].ranges_m[:6], np.float32([nan, 1.0, 1.9, 5.0, 11.0, nan]), equal_nan=True)
 
 
-def leaning_bag(path, rotation_said, **leans):
-    """A bag whose sensor leans; tf says ``rotation_said``."""
-    R = rotation(yaw=YAW, **leans)
-    messages = [tf(START, "base_link", "lidar", LIDAR, rotation_said, topic="/tf_static")]
-    for t in np.arange(0.0, 2.0, 0.1).round(3).tolist():
-        measured = spinning(lambda times, t=t: pose_at(t + times), LIDAR, R, columns=360)
-        messages.append(odom(START + t, pose_at([t])[0], bag_time=START + t))
-        messages.append(said("/points", START + t, cloud(START + t, measured, VELODYNE)))
-    return save(path, messages)
+LEANING = {"rings": 16, "columns": 360}
 
 
 @pytest.mark.parametrize("leans", [{"roll": -0.5}, {"pitch": 0.1}], ids=str)
 def test_a_sensor_that_leans_against_tf_is_levelled(tmp_path, leans):
-    right = open_source(leaning_bag(tmp_path / "right.mcap", quaternion(YAW, **leans), **leans))
-    wrong = open_source(leaning_bag(tmp_path / "wrong.mcap", quaternion(YAW), **leans))
+    right = open_source(save(tmp_path / "right.mcap", drive(stated=leans, **LEANING, **leans)))
+    wrong = open_source(save(tmp_path / "wrong.mcap", drive(**LEANING, **leans)))
     assert "the floor in" not in " ".join(right.survey().notes)
     degrees = math.degrees(abs(sum(leans.values())))
     said = f"the floor in /points leans by {degrees:.0f} deg against the mounting of 'lidar'; corrected"

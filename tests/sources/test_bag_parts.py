@@ -82,24 +82,20 @@ def test_each_topic_in_a_file_of_its_own(tmp_path):
 
 def test_recordings_of_several_days_are_no_parts(tmp_path):
     files = [save(tmp_path / f"run_{k}.bag", drive(60, start=100.0 + 90_000.0 * k)) for k in range(2)]
-    assert "run_1.bag: begins 89988 s after" in refusal_of_parts(files)
-    assert "give each as a recording of its own" in refusal_of_parts(files)
+    assert "run_1.bag: begins 89988 s after" in refusal(joined(files))
+    assert "give each as a recording of its own" in refusal(joined(files))
     near = [save(tmp_path / f"near_{k}.bag", drive(60, start=100.0 + 50.0 * k)) for k in range(2)]
     assert open_source(joined(near)).survey().scan_count == 120
-
-
-def refusal_of_parts(files):
-    return refusal(joined(files))
 
 
 def test_what_is_no_part(tmp_path):
     bag = save(tmp_path / "run.bag", drive(20))
     log = tmp_path / "run.log"
     log.write_text("FLASER 2 1 1 0 0 0 0 0 0 1 host 1\n")
-    assert "a file is given twice" in refusal_of_parts([bag, tmp_path / "." / "run.bag"])
-    assert "bags of ROS 1 and of ROS 2" in refusal_of_parts([bag, save(tmp_path / "run.mcap", drive(20))])
-    assert "a CARMEN log is not a part of several" in refusal_of_parts([bag, log])
-    assert "no such file" in refusal_of_parts([bag, tmp_path / "run_2.bag"])
+    assert "a file is given twice" in refusal(joined([bag, tmp_path / "." / "run.bag"]))
+    assert "bags of ROS 1 and of ROS 2" in refusal(joined([bag, save(tmp_path / "run.mcap", drive(20))]))
+    assert "a CARMEN log is not a part of several" in refusal(joined([bag, log]))
+    assert "no such file" in refusal(joined([bag, tmp_path / "run_2.bag"]))
 
 
 def test_a_name_with_a_comma_is_a_name(tmp_path):

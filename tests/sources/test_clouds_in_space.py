@@ -30,12 +30,11 @@ def imu(t, rate=(0.0, 0.0, 0.8)):
     return Said("/imu", IMU, START + t, {"payload": codec.encode(message, IMU)})
 
 
-def drive(layout=VELODYNE, R=None, scale=1.0, rings=16, mounting=LIDAR, tilt=None, sensors=True):
-    messages = [tf(START, "base_link", "lidar", mounting, tilt or quaternion(), topic="/tf_static")]
-    if sensors:
-        messages.append(tf(START, "base_link", "imu", (0.0, 0.0, 0.0), quaternion(roll=np.pi), topic="/tf_static"))
-        for t in np.arange(0.0, 1.6, 0.02):
-            messages += [odom(START + t, pose_at([t])[0]), imu(t, (0.0, 0.0, -0.8))]
+def drive(layout=VELODYNE, R=None, scale=1.0, rings=16, mounting=LIDAR):
+    messages = [tf(START, "base_link", "lidar", mounting, topic="/tf_static")]
+    messages.append(tf(START, "base_link", "imu", rotation=quaternion(roll=np.pi), topic="/tf_static"))
+    for t in np.arange(0.0, 1.6, 0.02):
+        messages += [odom(START + t, pose_at([t])[0]), imu(t, (0.0, 0.0, -0.8))]
     for t in np.arange(0.1, 1.5, 0.1).round(3).tolist():
         measured = spinning(lambda times, t=t: pose_at(t + times), LIDAR, R, rings=rings, columns=180)
         measured = Measured(scale * measured.points, measured.times)

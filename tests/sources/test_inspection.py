@@ -5,11 +5,7 @@ import pytest
 from fcslam.sources import BagOptions, write_bag
 from fcslam.sources.inspection import inspect
 from tests.sources import camera_records, carmen_text
-from tests.sources.bag_messages import BEAMS, LASER_POSE, drive, mounted, odom, save, text
-
-
-def without_tf(said):
-    return [message for message in said if not message.topic.startswith("/tf")]
+from tests.sources.bag_messages import BEAMS, LASER_POSE, drive, mounted, odom, save, text, without
 
 
 @pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
@@ -35,7 +31,7 @@ def test_a_bag_names_its_topics_rates_and_frames(tmp_path, suffix):
 
 
 def test_a_bag_that_cannot_be_mapped_is_shown_with_the_reason(tmp_path):
-    path = save(tmp_path / "run.bag", without_tf(drive(40)))
+    path = save(tmp_path / "run.bag", without(drive(40), "/tf_static"))
     found = inspect(path)
     assert "so the pose of the laser of /scan is unknown" in found.problem
     assert {topic.name for topic in found.bag.topics} == {"/odom", "/scan"}
