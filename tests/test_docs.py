@@ -2,8 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Iterator
-from functools import cache
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +34,10 @@ TEST = re.compile(r"`(test_\w+)`")
 SETTING = re.compile(r"`((?:robot|fleet|map)\.[a-z][\w.]*)`")
 
 
-def page_name(page: Path) -> str:
-    return str(page.relative_to(ROOT))
-
-
-pages = pytest.mark.parametrize("page", PAGES, ids=page_name)
+def faults(find: Callable[[Path, str], Iterable[str]]) -> dict[str, list[str]]:
+    """What ``find`` does not find in each page, given its path and its text."""
+    found = {str(page.relative_to(ROOT)): sorted(find(page, page.read_text(encoding="utf-8"))) for page in PAGES}
+    return {page: missing for page, missing in found.items() if missing}
 
 
 def is_there(name: str, page: Path) -> bool:
@@ -47,7 +45,9 @@ def is_there(name: str, page: Path) -> bool:
     return any((folder / name).is_file() for folder in (page.parent, ROOT, PACKAGE))
 
 
-def missing_files(text: str, page: Path) -> list[str]:
+def missing_files(page: Path, text: str) -> list[str]:
+    if page.name == "commands.md":  # the help of the commands names files of users
+        return []
     return [name for name in PATH.findall(OTHERS_LAUNCH.sub("", text)) if not is_there(name, page)]
 
 
@@ -112,53 +112,43 @@ def is_setting(key: str) -> bool:
     return True
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.name != "commands.md"], ids=page_name)
-def test_every_file_named_exists(page):
-    """The help of the commands names files of users."""
-    assert missing_files(page.read_text(encoding="utf-8"), page) == []
+def test_every_file_named_exists():
+    assert faults(missing_files) == {}
 
 
-@pages
-def test_every_link_leads_somewhere(page):
-    links = ["".join(groups).partition("#")[0] for groups in LINK.findall(page.read_text(encoding="utf-8"))]
-    assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []
+def test_every_link_leads_somewhere():
+    def broken(page, text):
+        links = ["".join(groups).partition("#")[0] for groups in LINK.findall(text)]
+        return [link for link in links if "://" not in link and not (page.parent / link).exists()]
+
+    assert faults(broken) == {}
 
 
-@pages
-def test_every_symbol_is_in_its_file(page):
-    assert missing_symbols(page.read_text(encoding="utf-8")) == []
+def test_every_symbol_is_in_its_file():
+    assert faults(lambda _, text: missing_symbols(text)) == {}
 
 
 @pytest.mark.slow
-@pages
-def test_every_command_parses(page):
-    found = [complaint(line, complete) for line, complete in commands(page.read_text(encoding="utf-8"))]
-    assert [text for text in found if text] == []
+def test_every_command_parses():
+    assert faults(lambda _, text: filter(None, (complaint(*command) for command in commands(text)))) == {}
 
 
-@pages
-def test_every_make_target_exists(page):
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    named = set(TARGET.findall(page.read_text(encoding="utf-8")))
-    assert [target for target in sorted(named) if not re.search(rf"^{target}:", makefile, re.MULTILINE)] == []
+def test_every_make_target_exists():
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    assert faults(lambda _, text: set(TARGET.findall(text)) - targets) == {}
 
 
-@pages
-def test_every_setting_exists(page):
+def test_every_setting_exists():
     files = {"map.png", "map.ply", "map.pgm", "map.yaml"}
-    named = set(SETTING.findall(page.read_text(encoding="utf-8"))) - files
-    assert [key for key in sorted(named) if not is_setting(key)] == []
+    assert faults(lambda _, text: {key for key in SETTING.findall(text) if not is_setting(key)} - files) == {}
 
 
-@cache
-def defined_tests() -> set[str]:
-    files = sorted((ROOT / "tests").rglob("test_*.py"))
-    return {name for file in files for name in re.findall(r"^def (test_\w+)\(", file.read_text("utf-8"), re.MULTILINE)}
-
-
-@pages
-def test_every_test_exists(page):
-    assert set(TEST.findall(page.read_text(encoding="utf-8"))) - defined_tests() == set()
+def test_every_test_exists():
+    files = (ROOT / "tests").rglob("test_*.py")
+    defined = {
+        name for file in files for name in re.findall(r"^def (test_\w+)\(", file.read_text("utf-8"), re.MULTILINE)
+    }
+    assert faults(lambda _, text: set(TEST.findall(text)) - defined) == {}
 
 
 def test_each_line_of_the_threat_model_names_a_test():
