@@ -207,6 +207,15 @@ def test_the_first_scan_without_odometry_has_a_pose_before_the_second_comes():
     assert sum(isinstance(packet.body, Keyscan) for packet in packets) == 1
 
 
+def test_the_first_scan_without_odometry_is_of_the_floor_before_a_change():
+    scans, frontend = list(spinning.drive(2.0)), RobotFrontend("r", RobotConfig())
+    frontend.process(scans[0])
+    frontend.change_floor("2")
+    for scan in scans[1:]:
+        frontend.process(scan)
+    assert [(track.floor, len(track)) for track in frontend.tracks] == [("", 1), ("2", len(scans) - 1)]
+
+
 def test_a_robot_at_rest_keeps_its_odometry():
     scan = next(iter(spinning.drive(odometry=spinning.pose_at)))
     frontend, _ = driven([scan] * 40)

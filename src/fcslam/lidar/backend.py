@@ -73,7 +73,10 @@ class LidarBackend:
         return rest
 
     def keyscan_poses(self) -> FloatArray:
-        """``T_map_base`` of every keyscan so far, shape (N, 3), after a robust solve that changes nothing here."""
+        """``T_map_base`` of every keyscan so far, shape (N, 3), after a robust solve that changes nothing here.
+
+        Before the first submap is complete, the poses are those of the tracker, in its frame.
+        """
         local, anchors = np.array(self._T_local_base).reshape(-1, 3), np.array(self._closer.keyscans)
         if not len(anchors):
             return local

@@ -16,8 +16,8 @@ from fcslam.config import Settings
 from fcslam.geometry import se2
 from fcslam.geometry.beams import is_same_laser
 from fcslam.lidar.evidence import CORRELATED, SIGMA_PER_TURN
-from fcslam.lidar.information import limited_information
 from fcslam.lidar.karto import KartoTracker
+from fcslam.lidar.matching import limited_information
 from fcslam.lidar.odometry import WHEELS, OdometryModel, odometry_error
 from fcslam.lidar.own_body import Polygon, Sectors
 from fcslam.lidar.scan import PointScan, point_scan

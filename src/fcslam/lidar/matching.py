@@ -52,6 +52,10 @@ WIDE_SCALE_M = 5.0 * NARROW_SCALE_M
 """Scale of the robust loss at the first step, metres, if the guess is that of odometry."""
 
 
+Diagonal = tuple[float, float, float]
+"""Diagonal elements over (x, y, theta)."""
+
+
 class ScanMatch(NamedTuple):
     """Pose of a scan in a field."""
 
@@ -157,7 +161,7 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter, tail):  # t
                 g[r] += weighted * difference[c]
                 H[r, c] += weighted
             H[r, r] += DAMPING
-        step = solve(H, g)
+        step = _solve(H, g)
         small = abs(step[0]) + abs(step[1]) < SMALL_STEP_M and abs(step[2]) < SMALL_STEP_RAD
         for r in range(3):
             pose[r] -= step[r]
@@ -180,7 +184,7 @@ def _match(scan, guess, prior, velocity_prior, field, wide, clutter, tail):  # t
 
 
 @njit(allocates=False)
-def solve(A, b):  # type: ignore[no-untyped-def]
+def _solve(A, b):  # type: ignore[no-untyped-def]
     """Solution of A x = b for a positive definite A (3, 3), by its LDL decomposition; compiles faster than LAPACK."""
     l10, l20 = A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
     d1 = A[1, 1] - l10 * A[1, 0]
@@ -215,9 +219,9 @@ def _normal_equations(equations, scan, pose, velocity, field, loss, velocity_pri
             weight /= 1.0 + velocity_prior[r] * velocity[r] * velocity[r]
         own[r, r] += weight + DAMPING
         reduced[3, r] = s2 * velocity_moment[r] + weight * velocity[r]
-    reduced[3, 0], reduced[3, 1], reduced[3, 2] = solve(own, reduced[3])
+    reduced[3, 0], reduced[3, 1], reduced[3, 2] = _solve(own, reduced[3])
     for r in range(3):
-        reduced[r, 0], reduced[r, 1], reduced[r, 2] = solve(own, mixed[r])
+        reduced[r, 0], reduced[r, 1], reduced[r, 2] = _solve(own, mixed[r])
     for r in range(3):
         g[r] -= mixed[r, 0] * reduced[3, 0] + mixed[r, 1] * reduced[3, 1] + mixed[r, 2] * reduced[3, 2]
         for c in range(3):
@@ -388,3 +392,43 @@ def _fit(scan, pose, velocity, field):  # type: ignore[no-untyped-def]
         total += log_likelihoods[i]
     n = max(1, len(points))
     return explained / n, known / n, log_likelihoods, total
+
+
+def limited_information(points: FloatArray, heading_rad: float, prior: Diagonal, variance: Diagonal) -> FloatArray:
+    """``((R' P R + diag(prior))^-1 + diag(variance))^-1``, shape (3, 3), over (x, y, theta) of the robot.
+
+    It is the information of a motion that points measure, with a prior, limited by errors that more points do not
+    reduce. ``points`` P is over (x, y) in a field and theta; writable, as code is compiled once. R is the robot's
+    heading there. The ``prior`` is positive, and ``variance`` the least one.
+    """
+    information: FloatArray = _limited(points, heading_rad, prior, variance)
+    return information
+
+
+@njit
+def _limited(points, heading, prior, variance):  # type: ignore[no-untyped-def]
+    cos, sin = np.cos(heading), np.sin(heading)
+    sum_, inverse = np.empty((3, 3)), np.empty((3, 3))
+    for c in range(3):  # R' P
+        inverse[0, c] = cos * points[0, c] + sin * points[1, c]
+        inverse[1, c] = cos * points[1, c] - sin * points[0, c]
+        inverse[2, c] = points[2, c]
+    for r in range(3):
+        sum_[r, 0] = cos * inverse[r, 0] + sin * inverse[r, 1]
+        sum_[r, 1] = cos * inverse[r, 1] - sin * inverse[r, 0]
+        sum_[r, 2] = inverse[r, 2]
+        sum_[r, r] += prior[r]
+    _invert(sum_, inverse)
+    for r in range(3):
+        inverse[r, r] += variance[r]
+    _invert(inverse, sum_)
+    return 0.5 * (sum_ + sum_.T)
+
+
+@njit
+def _invert(matrix, inverse):  # type: ignore[no-untyped-def]
+    unit = np.zeros(3)
+    for c in range(3):
+        unit[c] = 1.0
+        inverse[0, c], inverse[1, c], inverse[2, c] = _solve(matrix, unit)
+        unit[c] = 0.0

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fcslam.geometry import se2
-from fcslam.lidar.information import limited_information
-from fcslam.lidar.matching import match_scan
+from fcslam.lidar.matching import limited_information, match_scan
 from fcslam.lidar.scan import PointScan
 from fcslam.lidar.submap import Agreement, Submap, agreement
 from fcslam.records import FloatArray, Reason, ReasonCode

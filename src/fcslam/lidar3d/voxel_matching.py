@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,17 +37,6 @@ _SIGMA_M: Final = 0.5
 """Standard deviation of a point across its surface, for the information: those of neighbours are correlated."""
 LEAST_SHARE, LARGEST_VIOLATION, LEAST_POINTS = 0.75, 0.06, 600
 """For points in known space: least share on surfaces, largest share in free space, least number on surfaces."""
-
-
-class SpaceAgreement(NamedTuple):
-    """How well one voxel map agrees with another one at a transform."""
-
-    explained: float
-    """Share of the points in known space that lie on a surface."""
-    violation: float
-    """Share of the points in known space that lie in free space, well away from any surface."""
-    on_surface: int
-    """Points on a surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +132,12 @@ def align_maps(a: PreparedMap, b: PreparedMap, T_a_b: FloatArray) -> tuple[Float
     return T_a_b, np.asarray(0.5 * (information + information.T), np.float64)
 
 
-def space_agreement(query: PreparedMap, target: PreparedMap, T_target_query: FloatArray) -> SpaceAgreement:
-    """Measure how well ``query``, whose points are counted, agrees with ``target``."""
+def _agreement(query: PreparedMap, target: PreparedMap, T_target_query: FloatArray) -> tuple[float, float, int]:
+    """How well ``query``, whose points are counted, agrees with ``target``.
+
+    Returns, of the points in known space, the share on a surface, that in free space and well away from any surface,
+    and the number on a surface.
+    """
     points = se3.transform(T_target_query, query.points)
     distance_m, _ = target.near.query(points, distance_upper_bound=_OFF_SURFACE_M)
     is_free = _at(points, target.free)
@@ -152,7 +145,7 @@ def space_agreement(query: PreparedMap, target: PreparedMap, T_target_query: Flo
     known = max(1, int(np.count_nonzero(explained | is_free)))
     count = int(np.count_nonzero(explained))
     violating = int(np.count_nonzero(is_free & (distance_m > _OFF_SURFACE_M)))
-    return SpaceAgreement(count / known, violating / known, count)
+    return count / known, violating / known, count
 
 
 def seen_through(query: PreparedMap, target: PreparedMap, T_target_query: FloatArray) -> tuple[int, int]:
@@ -169,9 +162,8 @@ def seen_through(query: PreparedMap, target: PreparedMap, T_target_query: FloatA
 
 def disagreement(a: PreparedMap, b: PreparedMap, T_a_b: FloatArray, predicted: bool) -> Reason | None:
     """Why two maps do not show the same place at a transform; None if they do. A ``predicted`` one needs less."""
-    sides = space_agreement(b, a, T_a_b), space_agreement(a, b, se3.inverse(T_a_b))
-    explained, violation = min(side.explained for side in sides), max(side.violation for side in sides)
-    count, slack = min(side.on_surface for side in sides), 2.0 if predicted else 1.0
+    shares, violations, counts = zip(_agreement(b, a, T_a_b), _agreement(a, b, se3.inverse(T_a_b)), strict=True)
+    explained, violation, count, slack = min(shares), max(violations), min(counts), 2.0 if predicted else 1.0
     least, largest = 1.0 - slack * (1.0 - LEAST_SHARE), slack * LARGEST_VIOLATION
     if explained < least:
         return Reason(ReasonCode.NOT_ENOUGH_EXPLAINED, explained, least)

@@ -182,7 +182,7 @@ class RobotFrontend:
     def change_floor(self, floor: str) -> None:
         """Go on in a new session on another floor, 1 to 16 letters, digits and ``. _ + -``; empty: without a name."""
         if floor != self.scan_poses.floor:
-            if len(self.scan_poses):
+            if len(self.scan_poses) or self._deferred:
                 self.begin_session()
             self.scan_poses.floor, self.scan_poses.is_new_floor = floor, True
 
