@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fcslam.geometry import se2
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.lost import (
     FEWEST_SCANS,
@@ -23,6 +22,7 @@ from fcslam.records import LaserModel, frozen
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.predicted_motion import PREDICTED
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
+from tests.robot.kidnapping import put_down
 
 pytestmark = pytest.mark.slow
 
@@ -34,17 +34,6 @@ def mapped(scans):
     for scan in scans:
         frontend.process(scan)
     return frontend
-
-
-def moved_on(scans, before):
-    """``scans`` but the first, as wheels tell them that had stood there since the last one of ``before``."""
-    last, first = before[-1].T_odom_base, scans[0].T_odom_base
-    return [
-        replace(scan, stamp=before[-1].stamp + 0.2 * (k + 1), T_odom_base=frozen(
-            se2.compose(last, se2.between(first, scan.T_odom_base))
-        ))
-        for k, scan in enumerate(scans[1:])
-    ]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +71,7 @@ def test_scans_of_one_drive_are_hardly_doubted_and_never_lost(around):
 
 def test_another_place_is_doubted_and_lost(around, elsewhere):
     before = around[:120]
-    frontend, there = mapped(before), moved_on(elsewhere, before)
+    frontend, there = mapped(before), put_down(before[-1], elsewhere)[1:]
     assert is_doubtful(frontend.localize(there[0]), frontend, CONFIG)
     assert is_lost(there[:20], frontend)
 
@@ -98,12 +87,12 @@ def test_who_drove_on_did_so_by_trusted_odometry_and_by_what_is_seen(around, els
     before = around[:60]
     assert drove_on(last_of(before), around[60:62], WHEELS, RIGHT)
     assert not drove_on(last_of(before), around[60:62], WHEELS, OdometryTrust()), "nothing is known about odometry"
-    assert not drove_on(last_of(before), moved_on(elsewhere, before)[:8], WHEELS, RIGHT)
+    assert not drove_on(last_of(before), put_down(before[-1], elsewhere)[1:9], WHEELS, RIGHT)
 
 
 def test_one_scan_that_fits_is_enough_for_a_robot_that_drove_over_a_bump(around, elsewhere):
     before = around[:60]
-    bump = replace(around[60], ranges_m=moved_on(elsewhere, before)[0].ranges_m)
+    bump = replace(around[60], ranges_m=put_down(before[-1], elsewhere)[1].ranges_m)
     assert not drove_on(last_of(before), [bump], WHEELS, RIGHT)
     assert drove_on(last_of(before), [bump, around[61]], WHEELS, RIGHT)
 
@@ -133,7 +122,7 @@ def test_another_local_map_is_tied_to_the_past_by_odometry_alone(around):
 
 def test_scans_that_do_not_explain_one_another_tell_nothing(around, elsewhere):
     before = around[:120]
-    frontend, there = mapped(before), moved_on(elsewhere, before)
+    frontend, there = mapped(before), put_down(before[-1], elsewhere)[1:]
     rng = np.random.default_rng(0)
     torn = [replace(s, ranges_m=frozen(s.ranges_m * rng.uniform(0.5, 1.0, len(s.ranges_m)), np.float32)) for s in there]
     assert not is_lost(torn[:20], frontend)
@@ -151,7 +140,7 @@ def test_who_has_hardly_moved_cannot_be_lost(around, elsewhere):
     before = around[:15]
     frontend = mapped(before)
     assert 0.0 < frontend.travel_m < SETTLED_M
-    assert not is_doubtful(frontend.localize(moved_on(elsewhere, before)[0]), frontend, CONFIG)
+    assert not is_doubtful(frontend.localize(put_down(before[-1], elsewhere)[1]), frontend, CONFIG)
 
 
 def test_it_takes_a_way_and_several_scans_or_very_many(around):

@@ -9,6 +9,7 @@ from fcslam.geometry import se2
 from fcslam.robot.mapped_scans import MappedScans
 from fcslam.robot.wheel_odometry import FROZEN
 from tests import small_fleet
+from tests.lidar.worlds import pose_errors
 
 FIRST, LAST = 60, 100
 """Scans between which the sensor fails."""
@@ -25,9 +26,7 @@ def drive(scans):
 
 def errors_m(robot, track):
     """Of the positions of one session, each relative to its first pose."""
-    truth = small_fleet.truth_at(robot, track.stamps)
-    poses = track.T_odom_base()
-    return np.hypot(*(se2.between(poses[0], poses) - se2.between(truth[0], truth))[:, :2].T)
+    return pose_errors(track.T_odom_base(), small_fleet.truth_at(robot, track.stamps))[0]
 
 
 @pytest.mark.slow
