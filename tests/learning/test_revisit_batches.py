@@ -1,4 +1,4 @@
-"""Batches of points that were seen again, and what the objective asks of their codes."""
+"""Batches of points that were seen again and of views for rehearsal, and what the objective asks of their codes."""
 
 import numpy as np
 import pytest
@@ -10,9 +10,12 @@ torch = pytest.importorskip("torch", reason="needs fcslam[train]")
 from fcslam.learning.code_batches import (  # noqa: E402
     STEP_IMAGES,
     STEP_POINTS,
+    VIEWS,
     RevisitExamples,
     RevisitPair,
+    draw_rehearsal,
     draw_revisits,
+    draw_views,
 )
 from fcslam.learning.objective import (  # noqa: E402
     KEYPOINTS_WEIGHT,
@@ -28,6 +31,7 @@ RNG = np.random.default_rng(2)
 POINTS = RNG.uniform(8, SIZE - 8, (40, 2)).astype(np.float32)
 POSITIONS = RNG.uniform(0, 5, (40, 3))
 IMAGES = [textured(seed)[:SIZE, :SIZE] for seed in range(3)]
+WIDE = [image[:64] for image in IMAGES]
 PAIR = RevisitPair((0, 1), (POINTS, POINTS[::-1].copy()), POSITIONS)
 
 
@@ -100,3 +104,31 @@ def test_codes_that_leave_the_earlier_ones_cost_in_rehearsal():
     same = rehearsal_loss(former, former, points)
     opposite = rehearsal_loss((-columns, columns[:, :16]), former, points)
     assert opposite > 2.0 * same
+
+
+def test_views_have_the_size_of_the_images_and_show_them_otherwise():
+    views = draw_views(WIDE, 3)
+    assert len(views) == VIEWS
+    assert all(view.shape == (64, 96) and view.dtype == np.uint8 for view in views)
+    assert not any(np.array_equal(view, image) for view in views for image in WIDE)
+    assert len({view.tobytes() for view in views}) == VIEWS
+
+
+def test_views_and_batches_depend_on_the_seed_and_the_step_alone():
+    assert all(map(np.array_equal, draw_views(WIDE, 3), draw_views(WIDE, 3)))
+    assert not all(map(np.array_equal, draw_views(WIDE, 3), draw_views(WIDE, 4)))
+    one, again, other = (draw_rehearsal((96, 64), 3, step) for step in (5, 5, 6))
+    assert all(first.equal(second) for first, second in zip(one, again, strict=True))
+    assert not one[1].equal(other[1])
+
+
+def test_a_batch_has_points_within_its_views():
+    numbers, points = draw_rehearsal((96, 64), 3, 5)
+    assert points.shape == (STEP_IMAGES, STEP_POINTS, 2)
+    assert numbers.shape == (STEP_IMAGES,)
+    assert int(numbers.min()) >= 0
+    assert int(numbers.max()) < VIEWS
+    x, y = points.unbind(-1)
+    assert float(points.min()) >= 4.0
+    assert float(x.max()) <= 91.0
+    assert float(y.max()) <= 59.0

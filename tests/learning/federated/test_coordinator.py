@@ -68,6 +68,20 @@ def test_a_round_merges_as_a_hand_would(name, aggregate, share, tmp_path):
     assert not same(state.weights, START)
 
 
+def test_a_strategy_of_your_own_sees_every_update():
+    strategy = pytest.importorskip("flwr.serverapp.strategy", reason="needs fcslam[federated]")
+    from fcslam.learning.federated.flower import flower_aggregate
+
+    class First(strategy.FedAvg):
+        def aggregate_train(self, server_round, replies):
+            seen.append((server_round, len(replies)))
+            return super().aggregate_train(server_round, replies[:1])
+
+    seen, updates = [], [ragged(seed)(START, 0) for seed in range(5)]
+    assert same(flower_aggregate(First)(3, updates), updates[0])
+    assert seen == [(3, 5)]
+
+
 @pytest.mark.parametrize(("robots", "most"), [(1, 0.0), (2, 0.5), (4, 0.75)])
 def test_momentum_goes_no_further_than_all_robots_one_after_another(robots, most, tmp_path):
     def end(share):
