@@ -146,12 +146,14 @@ def test_a_folder_that_is_no_run_is_never_replaced(tmp_path, run, force):
         ("file/below", "used as"),
         ("/", "inside it"),
         ("/proc/nowhere/run", "used as"),
+        ("loop", "does not hold"),
         (".", "inside it"),
     ],
 )
 def test_impossible_places_are_refused_in_one_line(tmp_path, monkeypatch, where, why):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
+    (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(InputError, match=f"{why}[^\n]*$"):
         prepare_output(tmp_path / where, force=True)
 

@@ -77,9 +77,8 @@ def compiled(console: "Console", lidar_3d: bool = False) -> Iterator[None]:
 def copied_process(config: "RobotConfig | None") -> "Iterator[Executor]":
     """One worker, a copy of this process, until the end of this block; begin it before threads start.
 
-    ``config`` is that of a robot with a 2D LiDAR.
-
-    Both share the memory of the tracker's code, unless that is not compiled yet: nobody waits for a compiler here.
+    With ``config``, that of a robot with a 2D LiDAR, both processes share the memory of the tracker's code, unless that
+    is not compiled yet: nobody waits for a compiler here.
     """
     from fcslam.robot.backend_runner import copied_worker
     from fcslam.warmup import is_cold, warm_up_tracking

@@ -121,11 +121,11 @@ def prepare_output(path: Path, force: bool = False) -> Path:
 
 def prepare_folder(path: Path, force: bool, content: str, holds_content: Callable[[Path], bool]) -> Path:
     """As ``prepare_output``, for a folder of which ``holds_content`` says whether it holds ``content``."""
-    place = path.resolve()
+    place = Path(os.path.realpath(path))  # Path.resolve raises for a link to itself
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         bring_back(place)
-        occupied = place.exists() and (not place.is_dir() or any(place.iterdir()))
+        occupied = os.path.lexists(place) and (not place.is_dir() or any(place.iterdir()))
     except OSError as error:
         raise InputError(f"{path}: cannot be used as the output folder ({error})") from error
     if not os.access(place.parent, os.W_OK):

@@ -114,13 +114,13 @@ def federate_locally(
     ``folders`` hold the images of each robot, which has the name of its folder. ``on_step`` is called with a robot's
     name and the steps that it has done in the round.
     """
+    for folder in folders:
+        if not os.path.isdir(folder):
+            raise InputError(f"{folder}: is not a folder; give one folder of images for each robot")
     names = [folder.resolve().name for folder in folders]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
         raise InputError(f"two folders are called {min(twice)}; a robot has its folder's name, so rename one")
-    for folder in folders:
-        if not os.path.isdir(folder):
-            raise InputError(f"{folder}: is not a folder; give one folder of images for each robot")
     clients = {
         name: ImageClient(name, job.output / "robots" / name, job.device, on_step, folder)
         for name, folder in zip(names, folders, strict=True)
