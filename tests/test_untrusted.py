@@ -19,7 +19,7 @@ from backports import zstd
 from fcslam import untrusted
 from fcslam.config import load
 from fcslam.errors import InputError, SourceError
-from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, server_files
 from fcslam.mission.localization import read_map
 from fcslam.mission.mission import MissionConfig
 from fcslam.runs import RobotTrajectory, Run, open_run
@@ -185,8 +185,8 @@ MERGES = "a0: &a0 {x: 1}\n" + "".join(f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 
 def run(tmp_path):
     """A run folder that can be read."""
     drawn = OccupancyMap(np.array([[Occupancy.OCCUPIED, Occupancy.FREE]], np.uint8), 0.05, (0.0, 0.0))
-    files = {"map.pgm": pgm_bytes(drawn), "map.yaml": map_yaml(drawn, "map.pgm").encode()}
-    Run({"a": RobotTrajectory("a", 0, np.zeros(1), np.zeros((1, 3)))}, map_files=files).save(tmp_path / "run")
+    trajectory = RobotTrajectory("a", 0, np.zeros(1), np.zeros((1, 3)))
+    Run({"a": trajectory}, map_files=server_files("map", drawn)).save(tmp_path / "run")
     return tmp_path / "run"
 
 

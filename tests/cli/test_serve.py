@@ -2,13 +2,10 @@
 
 import json
 import os
-import re
 import shutil
 import signal
 import ssl
 import stat
-import subprocess
-import sys
 import time
 from contextlib import closing
 from pathlib import Path
@@ -33,6 +30,7 @@ from fcslam.wire.batches import read_batch, write_batch
 from fcslam.wire.http_transport import HttpTransport
 from fcslam.wire.keys import Server
 from fcslam.wire.packets import decode, encode
+from tests.cli.commands import Service
 from tests.small_fleet import in_order
 from tests.waiting import wait_for
 
@@ -117,28 +115,6 @@ def test_an_encrypted_key_is_told_and_no_passphrase_asked_for(credentials, tmp_p
     assert "encrypted" in line
     with pytest.raises(CloudError, match="encrypted"):
         HttpTransport(Server("https://cloud.test", certificate=(credentials / "cloud.pem", sealed)), "robot_1", "agent")
-
-
-class Service:
-    """A real one."""
-
-    def __init__(self, data, *options):
-        command = [sys.executable, "-m", "fcslam.cli", "serve", "--data", str(data), "--port", "0", *options]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        assert self.process.stdout is not None
-        self.url = re.search(r"https?://\S+:\d+", self.process.stdout.readline())[0]
-
-    def kill(self):
-        self.process.kill()
-        self.process.wait()
-        self.process.stdout.close()
-
-    def stop(self):
-        self.process.send_signal(signal.SIGTERM)
-        self.process.wait(60)
-        self.process.stdout.close()
-
-    close = stop
 
 
 def send(client, robot, packets, **headers):

@@ -1,10 +1,7 @@
 """`fcslam show`: what is refused at once, the file, and the real commands."""
 
-import os
-import re
 import signal
-import subprocess
-import sys
+from contextlib import closing
 
 import httpx
 import numpy as np
@@ -12,8 +9,9 @@ import pytest
 
 from fcslam.cli import main
 from fcslam.cli.show import LARGEST_BYTES
-from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, map_yaml, pgm_bytes
+from fcslam.maps.occupancy_map import Occupancy, OccupancyMap, server_files
 from fcslam.runs import RobotTrajectory, Run
+from tests.cli.commands import Command
 
 API = "/api/v1"
 
@@ -23,8 +21,7 @@ def run(tmp_path):
     """A small one."""
     occupancy = OccupancyMap(np.full((40, 60), Occupancy.FREE, np.uint8), 0.05, (0.0, 0.0))
     trajectory = RobotTrajectory("a", 0, np.arange(3.0), np.zeros((3, 3)))
-    files = {"map.pgm": pgm_bytes(occupancy), "map.yaml": map_yaml(occupancy, "map.pgm").encode()}
-    Run({"a": trajectory}, map_files=files).save(tmp_path / "run")
+    Run({"a": trajectory}, map_files=server_files("map", occupancy)).save(tmp_path / "run")
     return tmp_path / "run"
 
 
@@ -50,34 +47,6 @@ def test_a_report_is_one_file_and_replaces_another_only_if_told(run, tmp_path, c
     assert "exists" in refused("show", run, "--html", tmp_path, "--force")
 
 
-class Command:
-    """A real one that shows a page."""
-
-    def __init__(self, *words, **more):
-        command = [sys.executable, "-m", "fcslam.cli", *map(str, words)]
-        environment = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
-        environment |= {"PYTHONUNBUFFERED": "1", **more}
-        self.process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            env=environment,
-        )
-        self.url = re.search(r"http://\S+:\d+", self.process.stdout.readline())[0]
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.process.kill()
-        self.process.communicate()
-
-    def get(self, path):
-        return httpx.get(f"{self.url}{path}", timeout=30.0)
-
-
 @pytest.mark.system
 @pytest.mark.parametrize(("option", "end"), [("--open", signal.SIGINT), ("--no-open", signal.SIGTERM)])
 def test_a_browser_opens_if_it_may_and_ctrl_c_ends_the_page_with_success_also_while_somebody_looks(
@@ -86,10 +55,11 @@ def test_a_browser_opens_if_it_may_and_ctrl_c_ends_the_page_with_success_also_wh
     browser, opened = tmp_path / "browser", tmp_path / "opened"
     browser.write_text(f"#!/bin/sh\necho $1 > {opened}\n")
     browser.chmod(0o755)
-    with Command("show", run, option, BROWSER=f"{browser} %s") as command:
-        assert "<canvas" in command.get("/").text
+    no_display = {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
+    with closing(Command("show", run, option, BROWSER=f"{browser} %s", **no_display)) as command:
+        assert "<canvas" in httpx.get(command.url, timeout=30.0).text
         assert opened.exists() == (option == "--open")
-        assert command.get(f"{API}/fleet").json()["read_only"]
+        assert httpx.get(f"{command.url}{API}/fleet", timeout=30.0).json()["read_only"]
         with httpx.stream("GET", f"{command.url}{API}/events", timeout=30.0) as events:
             assert events.status_code == 200
             command.process.send_signal(end)

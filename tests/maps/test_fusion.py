@@ -52,7 +52,7 @@ class MapServer:
         return 0 if occupancy < self.info["free_thresh"] else -1
 
 
-def test_map_server_reads_back_every_cell_where_it_was():
+def test_map_server_reads_back_every_cell_where_it_was_and_the_walls_stand_where_the_robots_saw_them():
     fused = fuse(*fleet(), LASERS, CONFIG)
     served = MapServer(pgm_bytes(fused), map_yaml(fused, "map.pgm"))
     meaning = {Occupancy.UNKNOWN: -1, Occupancy.FREE: 0, Occupancy.OCCUPIED: 100}
@@ -60,11 +60,6 @@ def test_map_server_reads_back_every_cell_where_it_was():
     for (row, column), cell in np.ndenumerate(fused.cells):
         assert served.at(left + (column + 0.5) * side, bottom + (row + 0.5) * side) == meaning[Occupancy(cell)]
     assert set(np.unique(fused.cells)) == set(Occupancy)
-
-
-def test_the_walls_stand_where_the_robots_saw_them():
-    fused = fuse(*fleet(), LASERS, CONFIG)
-    served = MapServer(pgm_bytes(fused), map_yaml(fused, "map.pgm"))
     for x, y in [(CORRIDOR["right"], 1.0), (CORRIDOR["left"], 1.0), (2.0, CORRIDOR["top"]), (2.0, CORRIDOR["bottom"])]:
         assert max(served.at(x + dx, y + dy) for dx in (-0.03, 0, 0.03) for dy in (-0.03, 0, 0.03)) == 100
     assert served.at(2.0, 1.0) == 0
