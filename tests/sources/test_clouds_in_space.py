@@ -30,7 +30,7 @@ def imu(t, rate=(0.0, 0.0, 0.8)):
     return Said("/imu", IMU, START + t, {"payload": codec.encode(message, IMU)})
 
 
-def drive(layout=VELODYNE, R=None, scale=1.0, rings=16, mounting=LIDAR):
+def drive(layout=VELODYNE, R=None, scale=1.0, rings=16, mounting=LIDAR, is_stamped=True):
     messages = [tf(START, "base_link", "lidar", mounting, topic="/tf_static")]
     messages.append(tf(START, "base_link", "imu", rotation=quaternion(roll=np.pi), topic="/tf_static"))
     for t in np.arange(0.0, 1.6, 0.02):
@@ -38,7 +38,7 @@ def drive(layout=VELODYNE, R=None, scale=1.0, rings=16, mounting=LIDAR):
     for t in np.arange(0.1, 1.5, 0.1).round(3).tolist():
         measured = spinning(lambda times, t=t: pose_at(t + times), LIDAR, R, rings=rings, columns=180)
         measured = Measured(scale * measured.points, measured.times)
-        messages.append(said("/points", START + t, cloud(START + t, measured, layout)))
+        messages.append(said("/points", START + t, cloud((START + t) * is_stamped, measured, layout)))
     return messages
 
 
@@ -134,6 +134,12 @@ def test_what_is_wrong_with_clouds_is_said_in_one_line(tmp_path, changes, note):
     if "no floor" not in note:
         assert (np.abs(first.points_m[:, 2]) < 0.05).mean() > 0.05
     assert float(np.ptp(first.times_s)) == pytest.approx(0.1, abs=0.02)
+
+
+def test_clouds_without_stamps_have_the_times_of_their_recording(tmp_path):
+    source = opened(tmp_path, drive(is_stamped=False))
+    assert [each.stamp for each in source.records()] == pytest.approx(START + np.arange(0.2, 1.6, 0.1))
+    assert "14 of 14 messages of /points have no stamp; their times of recording" in " ".join(source.survey().notes)
 
 
 @pytest.mark.parametrize("height_m", [0.3, 0.7])

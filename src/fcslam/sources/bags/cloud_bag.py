@@ -51,7 +51,8 @@ class CloudBag(CloudRecording):
             for reading in chain.from_iterable(readings):
                 track.add(reading.stamp, reading.T_odom_base)
         first_ns, last_ns = self._bag.bag.census[self._topic].span_ns
-        notes = (*self._bag.bag.notes, *notes, *self._bag.robot.notes, *plan.scans.notes, *plan.notes)
+        found = *self._bag.bag.notes, *self._bag.unstamped(plan)
+        notes = (*found, *notes, *self._bag.robot.notes, *plan.scans.notes, *plan.notes)
         count, duration_s = self._topic.message_count, (last_ns - first_ns) * 1e-9
         return Survey(count, duration_s, track.length_m, (BAND_LASER,), self._audit.faults(), notes)
 

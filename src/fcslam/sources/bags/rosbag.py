@@ -191,12 +191,7 @@ class RosBag:
         notes = (
             *self._notes,
             *self.bag.notes,
-            *(
-                f"{self.path}: {its.unstamped} of {its.count} messages of {topic.name} have no stamp; their "
-                "times of recording count"
-                for topic, its in self.bag.census.items()
-                if topic in plan.read_topics() and not is_transforms(topic) and its.unstamped > 1
-            ),
+            *self.unstamped(plan),
             *chain.from_iterable(laser.notes(self.path, self.options.cloud_band) for laser in lasers),
             *plan.scans.notes,
             *chain.from_iterable(map(placeholder_note, repeat(self.path), placeholders, which)),
@@ -207,6 +202,14 @@ class RosBag:
         )
         survey = Survey(scans.count, scans.duration_s, scans.length_m, rig.lasers, audit.faults(), notes, rig.camera)
         return _Reading(survey, rig, placeholders)
+
+    def unstamped(self, plan: BagPlan) -> Iterator[str]:
+        """The topics of which messages have no stamp, a sentence each."""
+        for topic in sorted(plan.read_topics()):
+            its = self.bag.census[topic]
+            if its.unstamped > 1 and not is_transforms(topic):
+                said = f"{its.unstamped} of {its.count} messages of {topic.name} have no stamp"
+                yield f"{self.path}: {said}; their times of recording count"
 
     def _refuse(self, faults: Faults, scans: PathSummary, odometry: PathSummary, errors: Mapping[str, str]) -> None:
         path, topics, (laser, *_) = self.path, self.plan.topics, self.plan.lasers
