@@ -77,6 +77,14 @@ def test_clouds_carry_the_readings_of_wheels_and_imu_up_to_their_end(tmp_path, l
     assert 0.05 < floor.mean() < 0.6
 
 
+def test_without_wheels_a_notice_says_whether_a_gyro_gives_the_turns(tmp_path):
+    wheelless = [each for each in drive() if each.topic != "/odom"]
+    (note,) = opened(tmp_path, wheelless).survey().notes
+    assert "no odometry, so scan matching and the gyro give the motion; where" in note
+    (note,) = opened(tmp_path, [each for each in wheelless if each.topic != "/imu"]).survey().notes
+    assert "no odometry, so scan matching alone gives the motion; where" in note
+
+
 def test_a_robot_with_a_laser_stays_in_the_plane(tmp_path):
     ranges = np.linspace(2.0, 3.0, 90)
     scans = [scan(START + t, ranges + t, angle_increment=np.pi / 90) for t in np.arange(0.1, 1.5, 0.1)]

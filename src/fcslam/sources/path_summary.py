@@ -83,10 +83,11 @@ def fault_of_odometry(poses: Iterable[Pose]) -> str | None:
     return summary.fault if summary.count else "has no readable message"
 
 
-def without_odometry(interval_s: float) -> str:
-    """The notice about a robot without odometry whose scans come at this interval."""
-    seldom = f", and scans every {interval_s:.1g} s show too little of it: record them at 5 Hz or more, or odometry"
-    return (
-        f"no odometry, so scan matching alone gives the motion{seldom * (interval_s > LONGEST_INTERVAL_S)}; where the "
-        "scans do not fix the position, as along a bare corridor, the distance is unknown"
-    )
+def without_odometry(interval_s: float, has_gyro: bool = False) -> str:
+    """The notice about a robot without odometry whose scans come at this interval, with or without a gyro."""
+    said = "no odometry, so scan matching alone gives the motion"
+    if has_gyro:
+        said = "no odometry, so scan matching and the gyro give the motion"
+    if interval_s > LONGEST_INTERVAL_S:
+        said += f", and scans every {interval_s:.1g} s show too little of it: record them at 5 Hz or more, or odometry"
+    return f"{said}; where the scans do not fix the position, as along a bare corridor, the distance is unknown"

@@ -299,7 +299,7 @@ class _Planner:
             self._notes.append(f"{self._label}{candidate.name} {fault}, so it is not used")
         its = self._bag.census[self._topics.scans[0]]
         interval_s = (its.span_ns[1] - its.span_ns[0]) / (max(1, its.count - 1) * NANOSECONDS)
-        self._notes.append(f"{self._label}{without_odometry(interval_s)}")
+        self._notes.append(f"{self._label}{without_odometry(interval_s, bool(self._robot.of_type(IMU)))}")
         return None
 
     def _odometry_candidates(self, frame: str) -> Iterator[OdometryInput]:
