@@ -18,7 +18,7 @@ from pathlib import Path
 import common
 
 sys.path.insert(0, str(common.REPOSITORY))
-from tests.ros.played import for_player
+from tests.ros.test_live_networks import for_player
 
 RCLPY = Path(os.environ.get("FCSLAM_RCLPY", common.REPOSITORY / ".venv-ros" / "bin" / "python"))
 PLAYER = common.REPOSITORY / "tests" / "ros" / "rclpy_player.py"
