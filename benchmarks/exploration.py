@@ -7,7 +7,7 @@ far in all directions. The radius of a robot is 0.35 m. The joint map has cells 
 have no errors. Time: until 95 % of the area that a robot can reach is seen, at most an hour.
 
 Nearest: each robot drives to the frontier that is nearest to it, until it is there or the frontier is gone. Own: the
-same, but no robot takes a frontier that another one has. Assigned: `fcslam.maps.frontiers.Explorer`, asked every 5 s
+same, but no robot takes a frontier that another one has. Assigned: `fcslam.maps.exploration.Explorer`, asked every 5 s
 and when a robot has no goal, as on live robots. The weights of `Explorer` were chosen on the seeds 100 to 108 of the
 default kind.
 """

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fcslam.maps.frontiers import Explorer, Frontier, frontiers
+from fcslam.maps.exploration import Explorer
+from fcslam.maps.frontiers import Frontier, frontiers
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 
 SIDE_M = 0.1

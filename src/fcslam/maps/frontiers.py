@@ -1,7 +1,6 @@
-"""Frontiers of a map, where its free cells end at unknown ones, and which robot explores which of them."""
+"""Frontiers of a map: where its free cells end at unknown ones."""
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import cv2
@@ -17,20 +16,10 @@ LARGEST_GRID: Final = 400_000
 """Cells of the search grid; in a larger map they are wider."""
 VIEW_M: Final = 5.0
 """Side of the square around a frontier whose unknown area counts as its gain."""
-GAIN_M_PER_M2: Final = 0.5
-"""Metres of path that one square metre of unknown area is worth."""
 SAME_M: Final = 1.0
 """Frontiers this near in two moments are the same one. A robot farther from a passable cell reaches nothing."""
 POCKET_M2: Final = SAME_M**2
 """Smaller areas are no place for a robot."""
-KEEPING_M: Final = 3.0 * SAME_M
-"""Metres of path that another frontier must save before a robot turns to it."""
-REACHED_M: Final = 0.5 * SAME_M
-"""A robot this near to a frontier sees what can be seen from there."""
-SHARING_M: Final = 4.0 * VIEW_M
-"""Metres of path that a frontier costs more for each robot that goes there already."""
-UNREACHABLE: Final = 1e9
-"""Cost of a frontier without a path, metres; more than any path."""
 MARGIN: Final = 3
 """Unknown cells of the search grid on each side of the map."""
 
@@ -88,46 +77,6 @@ def frontiers(
         )
     ]
     return sorted(found, key=lambda one: (-one.gain_m2, one.point))
-
-
-class Explorer:
-    """Sends the robots of one map to its frontiers: one frontier a robot, at the least total cost.
-
-    A frontier costs the path, less what the unknown area there is worth. A robot keeps its frontier unless another one
-    saves much. A frontier that remains after a robot was there is not assigned again: nothing more is seen.
-    """
-
-    def __init__(self) -> None:
-        self._goals: dict[str, tuple[float, float]] = {}
-        self._visited: list[tuple[float, float]] = []
-
-    def assign(self, found: Sequence[Frontier], robots: Mapping[str, tuple[float, float]]) -> dict[str, Frontier]:
-        """The frontier of each robot that can reach one.
-
-        The frontiers of the present map have a distance for each robot, in order; positions in metres, in its frame.
-        """
-        from scipy.optimize import linear_sum_assignment  # it takes long to load, and a certificate does not need it
-
-        for robot, at in robots.items():
-            goal = self._goals.get(robot)
-            if goal is not None and math.dist(goal, at) <= REACHED_M:
-                self._visited.append(goal)
-        left = [one for one in found if not any(math.dist(one.point, seen) <= REACHED_M for seen in self._visited)]
-        cost = np.array([one.distances_m for one in left]).reshape(len(left), len(robots)).T
-        for row, robot in zip(cost, robots, strict=True):
-            row -= [
-                GAIN_M_PER_M2 * one.gain_m2
-                + KEEPING_M * (robot in self._goals and math.dist(one.point, self._goals[robot]) <= SAME_M)
-                for one in left
-            ]
-        # If there are more robots than frontiers, some go to the same one.
-        shared = np.hstack([cost + SHARING_M * others for others in range(len(robots))]) if robots else cost
-        reachable = np.isfinite(shared)
-        pairs = zip(*linear_sum_assignment(np.where(reachable, shared, UNREACHABLE)), strict=True)
-        names = list(robots)
-        chosen = {names[k]: left[number % len(left)] for k, number in pairs if reachable[k, number]}
-        self._goals = {robot: one.point for robot, one in chosen.items()}
-        return chosen
 
 
 def search_grid(occupancy: OccupancyMap) -> tuple[Cells, Cells, float, tuple[float, float]]:

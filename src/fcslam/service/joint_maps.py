@@ -21,7 +21,8 @@ from fcslam.cloud.result import FleetResult
 from fcslam.cloud.sessions import robot_and_epoch
 from fcslam.errors import StoreError
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.maps.frontiers import Explorer, Frontier, frontiers
+from fcslam.maps.exploration import Explorer
+from fcslam.maps.frontiers import Frontier, frontiers
 from fcslam.maps.joint_tiles import TileBatch, TileHistory, frame_of
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.metrics.trajectory import LARGEST_SPEED_M_S
