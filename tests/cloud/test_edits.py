@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from fcslam.cloud.cloud import Cloud
-from fcslam.cloud.edits import check_undo, edit_json, in_force, kind_of, read_edit
+from fcslam.cloud.edits import in_force
 from fcslam.cloud.settings import FleetConfig
 from fcslam.errors import InputError
 from fcslam.geometry import se2
+from fcslam.mission.edits import check_undo, edit_json, kind_of, read_edit
 from fcslam.records import (
     Cut,
     Edit,

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 import fcslam
-from fcslam.cloud.edits import kind_of
 from fcslam.cloud.settings import CloudConfig, FleetConfig
 from fcslam.errors import InputError, SourceError
+from fcslam.mission.edits import kind_of
 from fcslam.mission.localization import read_map
 from fcslam.mission.mission_file import edit_mission, read_mission
 from fcslam.records import Cut, FloorLabel, ManualClosure, MapRegion, Pin, RegionUse, Removal, Undo, Veto

@@ -55,7 +55,8 @@ def list_edits(mission: Mission) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from fcslam.cloud.edits import kind_of, undone
+    from fcslam.cloud.edits import undone
+    from fcslam.mission.edits import kind_of
     from fcslam.mission.mission_file import read_mission
 
     edits, table = read_mission(mission).edits, Table("edit", "time", "author", "change", "undone by")

@@ -4,10 +4,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from fcslam.cloud.edits import check_polygon
 from fcslam.errors import InputError
 from fcslam.geometry import se2
 from fcslam.geometry.alignment import n_point_alignment
+from fcslam.mission.edits import check_polygon
 from fcslam.mission.mission_file import SavedMission
 from fcslam.records import FloatArray, MapRegion, Pin, Placement, RegionUse, Veto
 from fcslam.runs import Run

@@ -15,12 +15,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from fcslam.cloud.edits import check_edit
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import robot_and_epoch, session_name
 from fcslam.cloud.settings import CloudConfig
 from fcslam.errors import PacketError, SourceError, StoreError
 from fcslam.mission.driving import Leg
+from fcslam.mission.edits import check_edit
 from fcslam.mission.mission_store import CONFIG, MissionStore, StoredPacket, check_mission
 from fcslam.records import Change, Edit, Undo
 from fcslam.runs.folder import MISSION

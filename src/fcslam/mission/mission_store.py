@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from fcslam.cloud.edits import check_undo, edit_json, floors, in_force, kind_of, read_edit, sessions_of, stamps_of
+from fcslam.cloud.edits import floors, in_force, stamps_of
 from fcslam.cloud.replies import SessionCorrection, is_news
 from fcslam.cloud.report import Track
 from fcslam.cloud.sessions import robot_and_epoch, robot_of, session_name
@@ -21,6 +21,7 @@ from fcslam.cloud.settings import CloudConfig
 from fcslam.config import one_line
 from fcslam.errors import InputError, PacketConflictError, StoreError
 from fcslam.geometry.groups import SE2, SE3, group_of
+from fcslam.mission.edits import check_undo, edit_json, kind_of, read_edit, sessions_of
 from fcslam.records import (
     Change,
     Channel,

@@ -9,9 +9,9 @@ from fastapi import APIRouter, HTTPException, Path, Request
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from fcslam.cloud.edits import read_edit
 from fcslam.config import StrictModel
 from fcslam.errors import InputError, StoreError
+from fcslam.mission.edits import read_edit
 from fcslam.records import MOST_NETWORK_BYTES, Change, Undo
 from fcslam.service.authentication import Role
 from fcslam.service.http.fleet import LOOK_S, edit_summary

@@ -18,11 +18,12 @@ from fastapi.responses import Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 import fcslam
-from fcslam.cloud.edits import in_force, is_removed, kind_of, undone
+from fcslam.cloud.edits import in_force, is_removed, undone
 from fcslam.cloud.sessions import session_name
 from fcslam.errors import InputError, StoreError
 from fcslam.geometry.groups import SE3, group_of
 from fcslam.maps.palette import robot_colors
+from fcslam.mission.edits import kind_of
 from fcslam.records import Channel, ClosureStatus, Edit, FloatArray
 from fcslam.runs import ClosureRow, Run
 from fcslam.service.authentication import VIEWERS, Role
