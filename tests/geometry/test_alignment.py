@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from fcslam.geometry import se2
-from fcslam.geometry.alignment import n_point_alignment, rotation_eq5, two_point_alignment
+from fcslam.geometry.alignment import n_point_alignment
+from fcslam.graph.cluster import rotation_eq5, two_point_alignment
 
 coordinate = st.floats(-50.0, 50.0)
 poses = st.tuples(coordinate, coordinate, st.floats(-3.1, 3.1))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fcslam.geometry.alignment import two_point_alignment
+from fcslam.geometry.alignment import ROUNDING
 from fcslam.geometry.groups import SE2, group_of
 from fcslam.graph.consistency import Closures, pairwise_consistency
 from fcslam.graph.evidence import (
@@ -128,6 +128,42 @@ def relative_frame(a: Trajectory, b: Trajectory, closures: Closures) -> FloatArr
     if min(distance[k, m], np.hypot(*(in_a[k] - in_a[m]))) < DIRECTION_M:
         return group.compose(T_a_j[0], group.inverse(b.poses[closures.j[0]]))
     return two_point_alignment(in_a[[k, m]], in_b[[k, m]])
+
+
+def rotation_eq5(alpha_rad: float) -> FloatArray:
+    """Homogeneous rotation matrix of the paper, shape (3, 3); with its signs it rotates by ``-alpha_rad``."""
+    cos, sin = np.cos(alpha_rad), np.sin(alpha_rad)
+    return np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])  # eq. (5)
+
+
+def two_point_alignment(points_a: ArrayLike, points_b: ArrayLike) -> FloatArray:
+    """Compute ``T_a_b`` from two matched points by eqs. (5) and (6) of FC-SLAM in their corrected form.
+
+    The paper prints eq. (6) as ``x' = -D R D x``, with the translation D on both sides of R. This is not a rigid map
+    between two frames. Its homogeneous coordinate is -1, and with it divided out the translation counts twice. The
+    corrected form is ``x' = D R x``.
+
+    Args:
+        points_a: shape (2, 2), metres, in the coordinate frame a (the paper's x').
+        points_b: the same points in the coordinate frame b (the paper's x); the midpoints coincide.
+
+    Returns:
+        ``T_a_b``, shape (3,), metres and radians.
+    """
+    a, b = np.asarray(points_a, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
+    if _coincide(a) or _coincide(b):
+        raise ValueError("two coincident points determine no rotation")
+    side_a, side_b = a[1] - a[0], b[1] - b[0]
+    alpha = np.arctan2(side_b[1], side_b[0]) - np.arctan2(side_a[1], side_a[0])
+    R = rotation_eq5(alpha)[:2, :2]
+    # eq. (6), corrected: x' = R x + (dx, dy)
+    dx, dy = a.mean(axis=0) - R @ b.mean(axis=0)
+    return np.array([dx, dy, np.arctan2(R[1, 0], R[0, 0])])
+
+
+def _coincide(points: FloatArray) -> bool:
+    side = points[1] - points[0]
+    return bool(side @ side <= ROUNDING * (points * points).sum())
 
 
 def local_frames(a: Trajectory, b: Trajectory, members: Closures) -> FloatArray:
