@@ -29,7 +29,7 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Simulate robots with unknown starts, map them, and compare the map with the truth."""
-    from fcslam.cli.evaluate.fleet_tables import report_fleet
+    from fcslam.cli.evaluate import report_fleet
     from fcslam.cli.map import map_sources
     from fcslam.cli.simulate import record_fleet
     from fcslam.lab.simulation.engine import gl_context, mujoco

@@ -1,12 +1,15 @@
 """`fcslam evaluate`: measure runs against references."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fcslam.cli.options import Csv
-from fcslam.cli.output import notices, verdict_lines
+from fcslam.cli.output import answers, notices, verdict_lines
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 RunFolder = Annotated[Path, typer.Argument(help="Run folder to measure.")]
 
@@ -28,9 +31,24 @@ def fleet(
     csv: Csv = None,
 ) -> None:
     """Compare a run with the truth: trajectories, closures by channel and stage, joins, the map, and bytes sent."""
-    from fcslam.cli.evaluate.fleet_tables import report_fleet
-
     report_fleet(run, truth, csv, notices())
+
+
+def report_fleet(run: Path, truth: Path | None, csv: Path | None, notices: "Console") -> None:
+    """Compare a run with the truth: print tables, and write the numbers to ``csv``."""
+    from fcslam.cli.progress import ProgressDisplay
+    from fcslam.lab.evaluation.relations import write_metrics
+    from fcslam.lab.evaluation.report import evaluate_fleet, fleet_metrics
+    from fcslam.lab.evaluation.tables import findings, fleet_tables
+
+    with ProgressDisplay(notices) as display:
+        display.start("evaluating")
+        report = evaluate_fleet(run, truth)
+    for table in fleet_tables(report):
+        answers().print(table)
+    typer.echo("\n".join(findings(report)))
+    if csv is not None:
+        write_metrics(fleet_metrics(report), csv)
 
 
 @app.command()
@@ -54,11 +72,11 @@ def relations(
     csv: Csv = None,
 ) -> None:
     """Measure a run by the relations metric of Kuemmerle et al. 2009: mean, standard deviation and maximum."""
-    from fcslam.cli.evaluate.fleet_tables import show_relations
     from fcslam.lab.evaluation.relations import evaluate_relations, relation_metrics, write_metrics
+    from fcslam.lab.evaluation.tables import relations_table
 
     errors = evaluate_relations(run, reference, across_robots, parts)
-    show_relations(errors, "relations across robots" if across_robots else "relations")
+    answers().print(relations_table(errors, "relations across robots" if across_robots else "relations"))
     if csv is not None:
         write_metrics(relation_metrics(errors), csv)
 

@@ -1,35 +1,29 @@
-"""What `fcslam evaluate fleet` and `relations` print."""
+"""What `fcslam evaluate fleet` and `relations` print: tables, and sentences."""
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
-import typer
-from rich.console import Console
 from rich.table import Table
 
-from fcslam.cli.output import answers
-from fcslam.cli.progress import ProgressDisplay
 from fcslam.lab.evaluation.closures import BOTH, ClosureScope
-from fcslam.lab.evaluation.relations import write_metrics
-from fcslam.lab.evaluation.report import FleetReport, evaluate_fleet, fleet_metrics
+from fcslam.lab.evaluation.report import FleetReport
 from fcslam.metrics.relations import RelationErrors
 
 _KINDS = {"intra_robot": "within robots", "inter_robot": "between robots"}
 
 
-def report_fleet(run: Path, truth: Path | None, csv: Path | None, notices: Console) -> None:
-    """Compare a run with the truth: print tables, and write the numbers to ``csv``."""
-    with ProgressDisplay(notices) as display:
-        display.start("evaluating")
-        report = evaluate_fleet(run, truth)
-    console, closures = answers(), (_closures(report, within) for within in ClosureScope)
-    for table in (_robots(report), _relative(report), *closures, _traffic(report)):
-        console.print(table)
-    for line in _findings(report):
-        typer.echo(line)
-    if csv is not None:
-        write_metrics(fleet_metrics(report), csv)
+def fleet_tables(report: FleetReport) -> list[Table]:
+    """The tables of robots, relative poses, closures and traffic."""
+    closures = (_closures(report, within) for within in ClosureScope)
+    return [_robots(report), _relative(report), *closures, _traffic(report)]
+
+
+def relations_table(errors: RelationErrors, what: str) -> Table:
+    """Errors by the relations metric; ``what`` was measured."""
+    table = Table("error", "mean", "std", "max", caption=f"{errors.used} of {errors.total} {what} used")
+    for name, spread, digits in (("translation, m", errors.translation, 4), ("rotation, deg", errors.rotation, 3)):
+        table.add_row(name, *(f"{value:.{digits}f}" for value in (spread.mean, spread.std, spread.maximum)))
+    return table
 
 
 def _percent(share: float) -> str:
@@ -81,7 +75,8 @@ def _traffic(report: FleetReport) -> Table:
     return table
 
 
-def _findings(report: FleetReport) -> Iterator[str]:
+def findings(report: FleetReport) -> Iterator[str]:
+    """What the tables do not say: the truth, the maps and their joins, and how well the map agrees."""
     scans, covered = (sum(counts) for counts in zip(*((s.poses, s.covered) for s in report.robots), strict=True))
     yield f"Truth: {report.truth}, at {covered} of {scans} scans. What the columns mean: docs/howto/evaluation.md"
     yield f"Maps: {report.maps}. Pairs of robots in one map: {len(report.joins)}, of them falsely joined: " + (
@@ -105,11 +100,3 @@ def _ratio(part: float, whole: float) -> float:
 
 def _number(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
-
-
-def show_relations(errors: RelationErrors, what: str) -> None:
-    """Print errors by the relations metric as a table."""
-    table = Table("error", "mean", "std", "max", caption=f"{errors.used} of {errors.total} {what} used")
-    for name, spread, digits in (("translation, m", errors.translation, 4), ("rotation, deg", errors.rotation, 3)):
-        table.add_row(name, *(f"{value:.{digits}f}" for value in (spread.mean, spread.std, spread.maximum)))
-    answers().print(table)
