@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from fcslam.cli import live, main
+from fcslam.cli.addresses import RosAddress
 from fcslam.cli.inputs import open_recording
 from fcslam.cli.output import notices
 from fcslam.cli.play import robot_watch
@@ -19,7 +20,6 @@ from fcslam.cli.progress import ProgressDisplay
 from fcslam.errors import CloudError, InputError
 from fcslam.live.records import RobotStatus, Wiring
 from fcslam.live.robot import Robot
-from fcslam.ros.addresses import RosAddress
 from fcslam.ros.parameters import NodeParameters
 from fcslam.ros.topics import SensorTopics
 from fcslam.runs import read_tum
@@ -179,7 +179,7 @@ def test_a_live_robot_that_is_turned_away_does_not_lose_its_run(monkeypatch, tmp
 
     kinds = {"/scan": SCAN, "/odom": ODOMETRY}
     topics = SensorTopics(kinds, ("/scan",), "/odom", ("/tf", "/tf_static"))
-    monkeypatch.setattr("fcslam.ros.addresses.open_network", lambda *_: MemoryNetwork())
+    monkeypatch.setattr("fcslam.cli.addresses.open_network", lambda *_: MemoryNetwork())
     monkeypatch.setattr("fcslam.ros.node.await_sensors", lambda *_: topics)
     monkeypatch.setattr("fcslam.ros.node.RobotNode.run", run)
     start = partial(Turned, wiring=Wiring(SameThread()))

@@ -2,8 +2,8 @@
 
 import pytest
 
+from fcslam.cli.addresses import RosAddress, open_network, parse_address
 from fcslam.errors import InputError
-from fcslam.ros.addresses import RosAddress, open_network, parse_address
 from fcslam.ros.topics import choose_sensor_topics
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import (

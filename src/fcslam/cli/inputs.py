@@ -15,8 +15,8 @@ from fcslam.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from fcslam.cli.addresses import RosAddress
     from fcslam.lidar.frontend import LidarConfig
-    from fcslam.ros.addresses import RosAddress
     from fcslam.ros.parameters import NodeParameters
     from fcslam.sources import BagOptions, Source, Survey
     from fcslam.sources.faults import Faults
@@ -132,7 +132,7 @@ class LiveSource(NamedTuple):
 
 def is_live(source: str) -> bool:
     """Whether ADDRESS or NAME=ADDRESS is the address of a live robot."""
-    from fcslam.ros.addresses import is_address
+    from fcslam.cli.addresses import is_address
 
     return is_address(source.rpartition("=")[2])
 
@@ -141,7 +141,7 @@ def live_source(
     argument: str, sensors: list[str] | None, ros_parameters: Path | None = None, use_sim_time: bool = False
 ) -> LiveSource:
     """The live robot of an argument ``ADDRESS`` or ``NAME=ADDRESS``, and its options."""
-    from fcslam.ros.addresses import parse_address
+    from fcslam.cli.addresses import parse_address
     from fcslam.ros.parameters import load_parameters
     from fcslam.sources import BagOptions
 

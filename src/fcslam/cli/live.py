@@ -61,9 +61,9 @@ def drive_live(
     """Run a live robot until it is stopped, and write the run to ``output``; ``start`` makes the robot.
     With a plan for ``learning``, it learns while it stands still.
     """
+    from fcslam.cli.addresses import open_network
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import EventKind
-    from fcslam.ros.addresses import open_network
     from fcslam.ros.node import RobotNode, await_sensors
     from fcslam.runs import prepare_output
     from fcslam.sources import IN_PLANE

@@ -62,7 +62,7 @@ def record(
 
 
 def _record(live: "LiveSource", output: Path, duration: float | None, force: bool, console: "Console") -> None:
-    from fcslam.ros.addresses import open_network
+    from fcslam.cli.addresses import open_network
     from fcslam.ros.node import await_sensors
     from fcslam.ros.record import record as record_messages
 
