@@ -39,6 +39,10 @@ THREATS = frozenset(re.findall(r"`(test_\w+)`", SECURITY.read_text(encoding="utf
 """The tests that the page on security names: they play an attacker."""
 
 
+def pytest_report_header():
+    return [] if find_spec("torch") else "without torch (fcslam[train]), no training is tested"
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
     """Collecting tests leaves no garbage, and they stay to the end: nobody looks through them again and again."""

@@ -2,25 +2,18 @@
 
 import numpy as np
 import pytest
+import torch
 
+from fcslam.errors import InputError
+from fcslam.features.detector import BUNDLED_NETWORK
+from fcslam.learning.code_batches import RevisitExamples, RevisitPair
+from fcslam.learning.code_training import CodeInputs, train_codes
+from fcslam.learning.federated.initial_weights import read_detector_weights
+from fcslam.learning.federated.networks import weights_to_network
+from fcslam.learning.network import KeypointNetwork, layer_names, network_from_state, sample_codes
+from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.training_loop import RAMP_STEPS, LocalTrainingPlan
 from tests.learning.textures import textured
-
-torch = pytest.importorskip("torch", reason="needs fcslam[train]")
-
-from fcslam.errors import InputError  # noqa: E402
-from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
-from fcslam.learning.code_batches import RevisitExamples, RevisitPair  # noqa: E402
-from fcslam.learning.code_training import CodeInputs, train_codes  # noqa: E402
-from fcslam.learning.federated.initial_weights import read_detector_weights  # noqa: E402
-from fcslam.learning.federated.networks import weights_to_network  # noqa: E402
-from fcslam.learning.network import (  # noqa: E402
-    KeypointNetwork,
-    layer_names,
-    network_from_state,
-    sample_codes,
-)
-from fcslam.learning.settings import TrainingSettings  # noqa: E402
-from fcslam.learning.training_loop import RAMP_STEPS, LocalTrainingPlan  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

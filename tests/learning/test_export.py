@@ -1,17 +1,14 @@
 """ONNX files: the same answers as torch at any size, and what is written in them."""
 
 import numpy as np
+import onnxruntime as runtime
 import pytest
+import torch
 
+from fcslam.errors import InputError
+from fcslam.learning.export import detector_version, export_onnx
+from fcslam.learning.network import KeypointNetwork
 from tests.learning.textures import textured
-
-torch = pytest.importorskip("torch", reason="needs fcslam[train]")
-pytest.importorskip("onnx", reason="needs fcslam[train]")
-runtime = pytest.importorskip("onnxruntime", reason="needs fcslam[train]")
-
-from fcslam.errors import InputError  # noqa: E402
-from fcslam.learning.export import detector_version, export_onnx  # noqa: E402
-from fcslam.learning.network import KeypointNetwork  # noqa: E402
 
 
 def network(encoder, seed=0):

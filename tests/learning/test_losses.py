@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="needs fcslam[train]")
-
-from fcslam.learning import losses  # noqa: E402
+from fcslam.learning import losses
 
 
 def tensor(*rows):

@@ -1,16 +1,9 @@
 """Shapes of the network's maps, where its cells are, and that nothing is tied to a corner of the image."""
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="needs fcslam[train]")
-
-from fcslam.learning.network import (  # noqa: E402
-    KeypointNetwork,
-    cell_log_probabilities,
-    cell_probabilities,
-    sample_codes,
-    smoothed,
-)
+from fcslam.learning.network import KeypointNetwork, cell_log_probabilities, cell_probabilities, sample_codes, smoothed
 
 encoders = pytest.mark.parametrize("encoder", ["light", "vgg"])
 

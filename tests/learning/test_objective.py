@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="needs fcslam[train]")
-
-from fcslam.learning.batches import collate  # noqa: E402
-from fcslam.learning.homography import warp  # noqa: E402
-from fcslam.learning.labels import Labels  # noqa: E402
-from fcslam.learning.objective import views_aligned  # noqa: E402
-from fcslam.learning.pairs import TrainingExample, draw_pair  # noqa: E402
-from tests.learning.textures import textured  # noqa: E402
+from fcslam.learning.batches import collate
+from fcslam.learning.homography import warp
+from fcslam.learning.labels import Labels
+from fcslam.learning.objective import views_aligned
+from fcslam.learning.pairs import TrainingExample, draw_pair
+from tests.learning.textures import textured
 
 SIZE = (120, 96)
 

@@ -2,12 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 
-from tests.learning.textures import textured
-
-torch = pytest.importorskip("torch", reason="needs fcslam[train]")
-
-from fcslam.learning.code_batches import (  # noqa: E402
+from fcslam.learning.code_batches import (
     STEP_IMAGES,
     STEP_POINTS,
     VIEWS,
@@ -17,7 +14,7 @@ from fcslam.learning.code_batches import (  # noqa: E402
     draw_revisits,
     draw_views,
 )
-from fcslam.learning.objective import (  # noqa: E402
+from fcslam.learning.objective import (
     KEYPOINTS_WEIGHT,
     MIN_NEGATIVE_DISTANCE_M,
     MIN_NEGATIVE_DISTANCE_PX,
@@ -25,6 +22,7 @@ from fcslam.learning.objective import (  # noqa: E402
     revisit_negatives,
     revisit_objective,
 )
+from tests.learning.textures import textured
 
 SIZE = 96
 RNG = np.random.default_rng(2)

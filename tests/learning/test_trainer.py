@@ -2,24 +2,18 @@
 
 import numpy as np
 import pytest
+import torch
 
+from fcslam.errors import InputError
+from fcslam.learning.labels import Teacher, fuse_keypoints, harris, peaks
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.objective import negatives, shift_grid, teacher_bits
+from fcslam.learning.pairs import TrainingExample
+from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.trainer import CHECKPOINT_FILE, ExecutionOptions, TrainingRun
+from fcslam.learning.training_loop import learning_rate
+from fcslam.learning.validation import collapse_warnings, validate, validation_pairs
 from tests.learning.textures import textured
-
-torch = pytest.importorskip("torch", reason="needs fcslam[train]")
-
-from fcslam.errors import InputError  # noqa: E402
-from fcslam.learning.labels import Teacher, fuse_keypoints, harris, peaks  # noqa: E402
-from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from fcslam.learning.objective import negatives, shift_grid, teacher_bits  # noqa: E402
-from fcslam.learning.pairs import TrainingExample  # noqa: E402
-from fcslam.learning.settings import TrainingSettings  # noqa: E402
-from fcslam.learning.trainer import (  # noqa: E402
-    CHECKPOINT_FILE,
-    ExecutionOptions,
-    TrainingRun,
-)
-from fcslam.learning.training_loop import learning_rate  # noqa: E402
-from fcslam.learning.validation import collapse_warnings, validate, validation_pairs  # noqa: E402
 
 SMALL = TrainingSettings(steps=6, pairs=1, side_px=64)
 pytestmark = pytest.mark.usefixtures("brief_validation")

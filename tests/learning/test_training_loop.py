@@ -1,21 +1,15 @@
 """A leg of a run: it starts at the given weights and does the steps that it is asked for."""
 
 import pytest
+import torch
 
+from fcslam.errors import InputError
+from fcslam.learning.labels import fuse_keypoints, harris, peaks
+from fcslam.learning.network import KeypointNetwork
+from fcslam.learning.pairs import TrainingExample
+from fcslam.learning.settings import TrainingSettings
+from fcslam.learning.training_loop import RAMP_STEPS, LocalTrainingPlan, local_training
 from tests.learning.textures import textured
-
-torch = pytest.importorskip("torch", reason="needs fcslam[train]")
-
-from fcslam.errors import InputError  # noqa: E402
-from fcslam.learning.labels import (  # noqa: E402
-    fuse_keypoints,
-    harris,
-    peaks,
-)
-from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from fcslam.learning.pairs import TrainingExample  # noqa: E402
-from fcslam.learning.settings import TrainingSettings  # noqa: E402
-from fcslam.learning.training_loop import RAMP_STEPS, LocalTrainingPlan, local_training  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

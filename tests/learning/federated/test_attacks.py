@@ -8,8 +8,6 @@ import httpx
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
-
 from fcslam.errors import UnavailableError
 from fcslam.learning.federated.coordinator import RULES
 from tests.learning.federated.fakes import Fake, fleet_of, run, settings

@@ -5,19 +5,17 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+import torch
 
+from fcslam.errors import InputError
+from fcslam.learning.code_batches import RevisitExamples, RevisitPair
+from fcslam.learning.federated.client import STATE_FILE, ImageClient, RevisitClient
+from fcslam.learning.federated.messages import TrainingRequest
+from fcslam.learning.federated.networks import network_to_weights
+from fcslam.learning.federated.settings import FederatedSettings
+from fcslam.learning.network import KeypointNetwork, layer_names, network_from_state
+from fcslam.storage.state_file import read_state, write_state
 from tests.learning.textures import textured
-
-torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
-
-from fcslam.errors import InputError  # noqa: E402
-from fcslam.learning.code_batches import RevisitExamples, RevisitPair  # noqa: E402
-from fcslam.learning.federated.client import STATE_FILE, ImageClient, RevisitClient  # noqa: E402
-from fcslam.learning.federated.messages import TrainingRequest  # noqa: E402
-from fcslam.learning.federated.networks import network_to_weights  # noqa: E402
-from fcslam.learning.federated.settings import FederatedSettings  # noqa: E402
-from fcslam.learning.network import KeypointNetwork, layer_names, network_from_state  # noqa: E402
-from fcslam.storage.state_file import read_state, write_state  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

@@ -6,9 +6,6 @@ import csv
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
-
-
 from fcslam.errors import InputError
 from fcslam.learning.federated.aggregation import average
 from fcslam.learning.federated.checkpoint import read_checkpoint

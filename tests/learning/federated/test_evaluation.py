@@ -4,8 +4,6 @@ import math
 
 import pytest
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
-
 from fcslam.cli.federate import round_line
 from fcslam.learning.federated.evaluation import compare
 from tests.learning.federated.fakes import Fake, rules, run, settings

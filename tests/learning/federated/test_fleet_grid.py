@@ -9,8 +9,6 @@ import httpx
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
-
 from fcslam.learning.federated.fleet_grid import MAX_ROBOTS, ONLINE_S, FleetGrid
 from fcslam.learning.federated.fleet_server import PATH, fleet_app
 from fcslam.learning.federated.messages import TrainingReply, TrainingRequest, write_reply

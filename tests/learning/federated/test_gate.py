@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
-
 from fcslam.learning.federated.evaluation import gate
 from fcslam.learning.federated.held_out import COLUMNS, MOST_PAIRS, check_judgement
 

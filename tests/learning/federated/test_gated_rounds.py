@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
-
 from fcslam.config import changed
 from fcslam.learning.federated.settings import FleetLearningSettings
 from tests.learning.federated.fakes import START, Fake, rules, run, settings, version

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
-
 from fcslam.learning.federated.held_out import APART_M, inliers
 from tests.learning.test_revisits import view
 from tests.lidar.worlds import box

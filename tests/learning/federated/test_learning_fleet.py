@@ -27,8 +27,6 @@ from fcslam.wire.packets import decode
 from tests.lab.simulation.gl import require_gl
 from tests.postgres import free_port
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
-
 LIMIT_S = 900.0
 SETTINGS = {
     "fewest_pairs": 20,  # far fewer than 200, which only a test may do

@@ -4,22 +4,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
 pytest.importorskip("flwr", reason="needs fcslam[federated]")
 
-from fcslam.errors import InputError  # noqa: E402
-from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector, network_file  # noqa: E402
-from fcslam.learning.export import export_onnx  # noqa: E402
-from fcslam.learning.federated.initial_weights import (  # noqa: E402
+from fcslam.errors import InputError
+from fcslam.features.detector import BUNDLED_NETWORK, OnnxConfig, OnnxDetector, network_file
+from fcslam.learning.export import export_onnx
+from fcslam.learning.federated.initial_weights import (
     drawn_images,
     prepare_initial_weights,
     read_detector_weights,
     with_batch_statistics,
 )
-from fcslam.learning.federated.networks import network_to_weights, weights_to_network  # noqa: E402
-from fcslam.learning.network import KeypointNetwork  # noqa: E402
-from tests.features.networks import tiny_network  # noqa: E402
+from fcslam.learning.federated.networks import network_to_weights, weights_to_network
+from fcslam.learning.network import KeypointNetwork
+from tests.features.networks import tiny_network
 
 
 def lived_in(encoder):

@@ -5,27 +5,22 @@ import time
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="needs fcslam[federated]")
-
-from fcslam.errors import InputError  # noqa: E402
-from fcslam.features.detector import BUNDLED_NETWORK  # noqa: E402
-from fcslam.learning.federated.client import RevisitClient  # noqa: E402
-from fcslam.learning.federated.held_out import judge  # noqa: E402
-from fcslam.learning.federated.initial_weights import read_detector_weights  # noqa: E402
-from fcslam.learning.federated.networks import weights_to_network  # noqa: E402
-from fcslam.learning.federated.robot_learning import (  # noqa: E402
-    SPLIT_FILE,
-    LearningRobot,
-    own_examples,
-)
-from fcslam.records import Channel, Place  # noqa: E402
-from fcslam.robot.backend import RobotBackend  # noqa: E402
-from fcslam.robot.backend_runner import inline  # noqa: E402
-from fcslam.robot.frontend import RobotConfig, RobotFrontend  # noqa: E402
-from fcslam.robot.keyframe_folder import KeyframeFolder, read_keyframes  # noqa: E402
-from fcslam.wire.packets import decode, encode  # noqa: E402
-from tests.robot.test_views import records_of  # noqa: E402
+from fcslam.errors import InputError
+from fcslam.features.detector import BUNDLED_NETWORK
+from fcslam.learning.federated.client import RevisitClient
+from fcslam.learning.federated.held_out import judge
+from fcslam.learning.federated.initial_weights import read_detector_weights
+from fcslam.learning.federated.networks import weights_to_network
+from fcslam.learning.federated.robot_learning import SPLIT_FILE, LearningRobot, own_examples
+from fcslam.records import Channel, Place
+from fcslam.robot.backend import RobotBackend
+from fcslam.robot.backend_runner import inline
+from fcslam.robot.frontend import RobotConfig, RobotFrontend
+from fcslam.robot.keyframe_folder import KeyframeFolder, read_keyframes
+from fcslam.wire.packets import decode, encode
+from tests.robot.test_views import records_of
 
 pytestmark = pytest.mark.slow
 

@@ -7,8 +7,6 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
-
 from fcslam.learning.federated.relay import learning_router
 from tests.service.http.desk import Desk
 

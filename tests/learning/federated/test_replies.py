@@ -8,8 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
-
 from fcslam.config import LONGEST_QUOTE
 from fcslam.errors import InputError
 from fcslam.learning.federated.client import InProcessFleet

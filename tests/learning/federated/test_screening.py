@@ -3,15 +3,7 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="needs fcslam[federated]")
-
-
-from fcslam.learning.federated.screening import (
-    BOUNDS,
-    ScreeningBounds,
-    screen,
-    update_length,
-)
+from fcslam.learning.federated.screening import BOUNDS, ScreeningBounds, screen, update_length
 
 RNG = np.random.default_rng(4)
 BEFORE = {
