@@ -35,19 +35,6 @@ def test_every_square_keeps_its_newest_and_never_more(way, most, side_m):
     assert driven(way, side_m, most) == sorted(k for numbers in squares.values() for k in numbers[-most:])
 
 
-def test_a_robot_that_drives_its_rounds_for_ever_keeps_places_of_the_whole_round():
-    way = [(10.0 * np.cos(0.1 * k), 10.0 * np.sin(0.1 * k)) for k in range(1000)]
-    kept = driven(way, 2.0, 6)
-    assert len(kept) < 300
-    assert {square(way[k], 2.0) for k in kept} == {square(xy, 2.0) for xy in way}
-
-
-def test_a_robot_that_sweeps_a_floor_lane_by_lane_keeps_all_of_the_floor():
-    way = [(float(x), 0.25 * lane) for lane in range(80) for x in (range(10) if lane % 2 else range(9, -1, -1))]
-    kept = driven(way, 2.0, 1)
-    assert {square(way[k], 2.0) for k in kept} == {square(xy, 2.0) for xy in way}
-
-
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_few_places_are_never_too_many(count):
     assert not len(surplus_places(np.zeros((count, 2)), 5.0, 3))

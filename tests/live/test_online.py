@@ -184,29 +184,6 @@ def test_an_announced_detector_is_taken_and_once_more_at_the_same_scan(scans, tm
     assert robot.status().notices == ("detector tiny-2 from now on",)
 
 
-def test_a_robot_on_another_floor_was_not_lost(scans, tmp_path):
-    cloud, events, pause = FakeCloud(), [], threading.Event()
-    half = len(scans) // 2
-    robot = Robot(
-        "alice", state=tmp_path, own_map=False, floor="1", on_event=events.append,
-        wiring=Wiring(SameThread(), Clock(), lambda _: pause.wait(0.001), transport=Network(cloud)),
-    )  # fmt: skip
-    with closing(robot):
-        for scan in scans[:half]:
-            robot.add(scan)
-        robot.change_floor("2")
-        robot.add(scans[half])
-        for scan in scans[half + 1 :]:
-            robot.add(scan)
-        robot.finish()
-        now = robot.status()
-    assert (now.localization, now.times_lost) == (LocalizationState.MAPPING, 0)
-    told = [event.kind for event in events if event.kind in {*EventKind} - {EventKind.CORRECTED, EventKind.ONLINE}]
-    assert told == [EventKind.FLOOR]
-    hellos = [decode(data).body for data in cloud.stored.values() if isinstance(decode(data).body, Hello)]
-    assert [(hello.epoch, hello.floor) for hello in hellos] == [(0, "1"), (1, "2")]
-
-
 def test_a_lost_robot_is_lost_until_the_cloud_has_found_it(tmp_path):
     """Put down elsewhere and, after another while, stopped and resumed: each part travels in an epoch of its own."""
     scans, moment = kidnapping()

@@ -13,10 +13,13 @@ from fcslam.errors import FcslamError, InputError
 from fcslam.geometry import se2
 from fcslam.live.records import Wiring
 from fcslam.sources import open_source
+from fcslam.wire.messages import Hello
+from fcslam.wire.packets import decode
 from tests import small_fleet
 from tests.carmen_logs import write_carmen
 from tests.lidar import worlds
 from tests.live.same_thread import SameThread
+from tests.robot.fake_cloud import FakeCloud, Network
 from tests.robot.kidnapping import kidnapping
 from tests.spinning_lidar import circle, room
 from tests.spinning_lidar import drive as drive_lidar
@@ -347,20 +350,22 @@ def test_two_lasers_are_told_apart_by_name(scans):
 
 
 def test_a_lift_begins_a_session_on_another_floor(scans, tmp_path):
-    events = []
-    half = len(scans) // 2
-    with fcslam.Robot("anna", scans[0].laser, floor="1", wiring=Wiring(SameThread()), on_event=events.append) as robot:
+    cloud, events, half = FakeCloud(), [], len(scans) // 2
+    wiring = Wiring(SameThread(), transport=Network(cloud))
+    with fcslam.Robot("alice", scans[0].laser, floor="1", wiring=wiring, on_event=events.append) as robot:
         drive(robot, scans[:half])
         robot.change_floor("1")
         robot.change_floor("2")
         poses = drive(robot, scans[half:])
-        assert (robot.status().times_lost, robot.status().localization) == (0, "mapping")
         with pytest.raises(InputError, match="is not 1 to 16"):
             robot.change_floor("the attic")
         robot.finish()
+        assert (robot.status().times_lost, robot.status().localization) == (0, "mapping")
         run = robot.save(tmp_path / "run")
-    assert {name: trajectory.floor for name, trajectory in run.trajectories.items()} == {"anna": "1", "anna+1": "2"}
+    assert {name: trajectory.floor for name, trajectory in run.trajectories.items()} == {"alice": "1", "alice+1": "2"}
     assert {trajectory.map_index for trajectory in run.trajectories.values()} == {0, 1}
     assert all(pose.is_localized for pose in poses)
-    assert [event.kind for event in events if event.kind == fcslam.EventKind.FLOOR] == ["floor"]
-    assert not [event for event in events if event.kind == fcslam.EventKind.LOST]
+    told = [event.kind for event in events if event.kind in {fcslam.EventKind.FLOOR, fcslam.EventKind.LOST}]
+    assert told == [fcslam.EventKind.FLOOR]
+    hellos = [decode(data).body for data in cloud.stored.values() if isinstance(decode(data).body, Hello)]
+    assert [(hello.epoch, hello.floor) for hello in hellos] == [(0, "1"), (1, "2")]
