@@ -20,7 +20,6 @@ from fcslam.mission.mission import (
     MissionConfig,
     MissionInputs,
     Watch,
-    check_robots,
     continued_config,
     run_mission,
 )
@@ -97,19 +96,10 @@ def map_recordings(
     if isinstance(floors, str):
         floors = {robot.name: floors for robot in robots if floors}
     inputs = MissionInputs(earlier, tuple(vetoes), floors, anchors)
-    run = run_recordings(robots, settings, inputs, processes, progress or (lambda _: None))
+    run = run_mission(robots, settings, progress or (lambda _: None), inputs, side_by_side(processes))
     if output is not None:
         run.save(output, force)
     return run
-
-
-def run_recordings(
-    recordings: Sequence[Source], settings: MissionConfig, inputs: MissionInputs, processes: int, watch: Watch
-) -> Run:
-    """Map opened recordings, ``processes`` robots at a time, after a check that none is there twice."""
-    check_robots(recordings)
-    sources.check_copies(recordings)
-    return run_mission(recordings, settings, watch, inputs, side_by_side(processes))
 
 
 def localize(

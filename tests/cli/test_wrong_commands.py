@@ -97,8 +97,10 @@ WRONG = [
     ("serve --data data -c fleet.join_map=false", "did you mean 'fleet.join_maps'?", ""),
     # Missions, plans and tags
     ("map r.log --onto nowhere", "nowhere: no such file; `fcslam map` writes mission.fcslam into each run", ""),
-    ("map run --onto r.log", "run: is a run, not a recording", "map r.log --onto run"),
-    ("map r.log --onto pic.png", "pic.png: not a mission file", "map r.log --onto run"),
+    ("map run --onto r.bag", "run: is a run, not a recording", "map r.bag --onto run"),
+    ("map r.bag --onto pic.png", "pic.png: not a mission file", "map r.bag --onto run"),
+    ("map r.log --onto run", "r+1 and r of the earlier mission have the same scans at", "map r.bag --onto run"),
+    ("map b=r.log --onto run", "b and r of the earlier mission have the same scans at", "map r.bag --onto run"),
     ("map r.log --plan plan.png", "give metres per pixel, as in --plan-scale 0.02", ""),
     ("map r.log --plan r.log", "r.log: cannot be read as a picture; save the plan as PNG", ""),
     ("map r.log --plan nowhere.png", "nowhere.png: cannot be read (No such file or directory); give", ""),

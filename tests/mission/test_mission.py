@@ -9,7 +9,7 @@ import pytest
 from fcslam.errors import FcslamError, PacketError, SourceError
 from fcslam.mission import mission
 from fcslam.mission.mission import MissionConfig, MissionInputs, continued_config, run_mission
-from fcslam.mission.mission_file import EMPTY
+from fcslam.mission.mission_file import EMPTY, read_mission
 from fcslam.records import Channel, ClosureStatus, Veto
 from fcslam.sources import open_source
 from tests.carmen_logs import write_carmen
@@ -141,6 +141,22 @@ def test_a_recording_may_have_any_name_that_a_robot_can_bear(tmp_path, drawn, na
         return
     with pytest.raises(error, match="rename"):
         run_mission(sources, MissionConfig(), watch=lambda _: pytest.fail("worked"))
+
+
+@pytest.mark.parametrize("left_out", [0, 20])
+@pytest.mark.parametrize("later", [False, True])
+def test_scans_that_another_recording_has_are_refused(tmp_path, drawn, left_out, later):
+    """A copy or a part of a recording, in the same mission or in one that goes on from it."""
+    scans = list(drawn.robots[0].scans())
+    for name, its in (("whole", scans), ("part", scans[left_out:])):
+        write_carmen(tmp_path / f"{name}.clf", its)
+    whole, part = (open_source(tmp_path / f"{name}.clf") for name in ("whole", "part"))
+    run_mission([whole], MissionConfig()).save(tmp_path / "run")
+    onto, given = (read_mission(tmp_path / "run"), [part]) if later else (EMPTY, [whole, part])
+    with pytest.raises(
+        SourceError, match=r"have the same scans at \d+\.\d+ s, so they are copies or overlapping parts"
+    ):
+        run_mission(given, MissionConfig(), inputs=MissionInputs(onto))
 
 
 def test_a_refusal_by_the_cloud_is_not_lost(logs, monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 
 import fcslam
 from fcslam.errors import SourceError
-from fcslam.sources import BagOptions, check_copies, open_fleet, open_source
+from fcslam.sources import BagOptions, open_fleet, open_source
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.inspection import inspect
 from tests.sources.bag_messages import BEAMS, drive, odom, pose_at, quaternion, save, scan, tf
@@ -143,8 +143,8 @@ def test_one_recording_given_twice_is_refused(tmp_path, kind):
     linked = tmp_path / "linked.mcap"
     linked.symlink_to(path)
     for twice in ([path, path], [path, linked], [path, tmp_path / "fleet.mcap:/robot2"]):
-        with pytest.raises(SourceError, match=r"share \d+ scans, so they are copies"):
-            check_copies(open_fleet([(each, f"name{number}") for number, each in enumerate(twice)]))
+        with pytest.raises(SourceError, match=r"have the same scans at .* s, so they are copies"):
+            fcslam.map_recordings({f"name{number}": each for number, each in enumerate(twice)})
 
 
 def two_frames(rear_in_tf=True):

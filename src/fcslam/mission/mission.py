@@ -6,6 +6,8 @@ sources -> robot (LiDAR SLAM, features) -> packets -> cloud (places -> graph -> 
 import heapq
 import itertools
 import logging
+import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -17,7 +19,7 @@ from fcslam.cloud.cloud import Cloud
 from fcslam.cloud.edits import in_force
 from fcslam.cloud.report import Track, fuse_members, keyscan_track, run_of, traffic_metrics
 from fcslam.cloud.result import FleetResult
-from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of
+from fcslam.cloud.sessions import check_robot, robot_and_epoch, robot_of, session_name
 from fcslam.cloud.settings import CloudConfig, FleetConfig, FusionStrategy
 from fcslam.config import Settings, dump
 from fcslam.errors import FcslamError, InputError, PacketError, SourceError
@@ -28,10 +30,11 @@ from fcslam.mission.floors import on_floors
 from fcslam.mission.mission_file import EMPTY, SavedMission, as_stored, mission_bytes
 from fcslam.mission.mission_store import StoredPacket
 from fcslam.processes import trim_memory
-from fcslam.records import Edit, Placement, Veto
+from fcslam.records import Edit, Keyscan, Placement, Veto
 from fcslam.robot.frontend import RobotConfig
 from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
+from fcslam.sources.contradictions import count_returns
 from fcslam.sources.faults import Faults
 from fcslam.wire.ledger import Ledger
 from fcslam.wire.messages import Acknowledgement, Packet
@@ -41,6 +44,8 @@ _log = logging.getLogger(__name__)
 
 AUTHOR = "fcslam map"
 """The author of vetoes that are given with the recordings."""
+_KEYSCANS_SHARED = 3
+"""Keyscans that two recordings share at least if they overlap: robots never measure the same numbers at one time."""
 
 
 class MissionConfig(Settings):
@@ -122,7 +127,9 @@ def run_mission(
     meter = _Meter(watch, cloud, known)
     with drive(sources, config.robot) as robots:
         new = [continued(legs, onto.session_count(name)) for legs, name in zip(robots, recordings, strict=True)]
-        streams = [_packets(legs, meter) for legs in new]
+        earlier = itertools.chain(*onto.packets.values())
+        sessions = {key: f"{name} of the earlier mission" for sent in earlier for key, name in _keyscan(sent)}
+        streams = [_without_copies(_packets(legs, meter), sessions) for legs in new]
         streams += [_packets(legs, meter) for legs in onto.legs()]
         for sent in heapq.merge(*streams, key=lambda sent: sent.packet.order):
             cloud.apply(sent)
@@ -204,6 +211,37 @@ def _packets(legs: Iterator[Leg], meter: "_Meter") -> Iterator[SizedPacket]:
     for leg in legs:
         meter.count(leg)
         yield from leg.packets
+
+
+def _without_copies(packets: Iterator[SizedPacket], sessions: dict[int, str]) -> Iterator[SizedPacket]:
+    """The packets of a recording, which must not share scans with another one, whatever names and formats they have.
+
+    Args:
+        packets: those of the recording.
+        sessions: the session of each keyscan that is known; those of the recording are added.
+
+    Raises:
+        SourceError: the recording shares ``_KEYSCANS_SHARED`` keyscans with another session.
+    """
+    shared: Counter[str] = Counter()
+    for sent in packets:
+        for key, name in _keyscan(sent):
+            other = sessions.setdefault(key, name)
+            shared[other] += other != name
+            if shared[other] == _KEYSCANS_SHARED:
+                raise SourceError(
+                    f"{name} and {other} have the same scans at {sent.packet.time:.3f} s, so they are copies or "
+                    "overlapping parts of one recording; give each scan once"
+                )
+        yield sent
+
+
+def _keyscan(sent: SizedPacket) -> Iterator[tuple[int, str]]:
+    """A number that copies of a keyscan share, and its session; nothing without a return and for other packets."""
+    packet, body = sent.packet, sent.packet.body
+    if isinstance(body, Keyscan) and count_returns(body.ranges_m, math.inf):
+        key = hash((round(body.stamp, 3), body.ranges_m.tobytes()))  # formats round stamps to a millisecond
+        yield key, session_name(packet.robot, packet.epoch)
 
 
 class _Meter:

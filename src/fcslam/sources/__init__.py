@@ -6,7 +6,6 @@ from fcslam.sources.faults import Fault as Fault
 from fcslam.sources.faults import FaultCount as FaultCount
 from fcslam.sources.faults import Faults as Faults
 from fcslam.sources.formats import IN_PLANE as IN_PLANE
-from fcslam.sources.formats import check_copies as check_copies
 from fcslam.sources.formats import is_whole as is_whole
 from fcslam.sources.formats import open_fleet as open_fleet
 from fcslam.sources.formats import open_source as open_source

@@ -1,18 +1,14 @@
 """The known formats of recordings, and opening a recording by its content."""
 
 import os
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fcslam.errors import SourceError
-from fcslam.records import CloudScan, LaserScan, SensorRecord
 from fcslam.sources.bags.container import is_bag, parts_of
 from fcslam.sources.bags.options import BagOptions
-from fcslam.sources.contradictions import count_returns
 from fcslam.sources.logs.archive import head, robot_name, translate_errors
 from fcslam.sources.logs.carmen import is_carmen
 from fcslam.sources.logs.carmen_log import CarmenLog
@@ -27,8 +23,6 @@ IN_PLANE = (
     "the same walls, and needs level floors; without such a robot, leave out --3d"
 )
 """What a robot with 2D scans does in a map in space."""
-_SCANS_SHARED = 20
-"""Scans that two recordings share at least if they overlap."""
 
 
 def open_fleet(
@@ -78,34 +72,6 @@ def bag_of(source: Source) -> "RosBag | None":
     from fcslam.sources.bags.rosbag import RosBag
 
     return source if isinstance(source, RosBag) else None
-
-
-def check_copies(sources: Sequence[Source]) -> None:
-    """Refuse a recording that is there twice, whole or cut, whatever the names and formats of its files are."""
-    if len(sources) < 2:
-        return
-    owners: dict[int, Source] = {}
-    for source in sources:
-        own = set(filter(None, map(_fingerprint, source.records())))
-        for name, shared in Counter(owners[scan].name for scan in own & owners.keys()).items():
-            if shared >= _SCANS_SHARED:
-                raise SourceError(
-                    f"{source.name} and {name} share {shared} scans, so they are copies or overlapping parts of one "
-                    "recording; give each scan once"
-                )
-        owners.update(dict.fromkeys(own, source))
-
-
-def _fingerprint(record: SensorRecord) -> int | None:
-    """A number that copies of a scan share; None for other records, and for a scan without a return."""
-    match record:
-        case CloudScan():
-            measured = record.points_m.tobytes()
-        case LaserScan() if count_returns(record.ranges_m, inf):
-            measured = record.ranges_m.tobytes()
-        case _:
-            return None
-    return hash((round(record.stamp, 3), measured))  # formats round stamps to a millisecond
 
 
 def robot_in(path: Path) -> tuple[Path, str | None]:
