@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fcslam.compiled import njit
 from fcslam.geometry import se2
 from fcslam.geometry.groups import group_of
 from fcslam.lidar.occupancy import Casting, OccupancyConfig, draw_over
@@ -17,8 +18,10 @@ from fcslam.live.map_poses import CorrectedOdometry
 from fcslam.live.records import RobotPose
 from fcslam.maps.joint_tiles import padded
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
+from fcslam.maps.teammates import returns_near
 from fcslam.records import FloatArray, Keyscan, LaserModel, LaserScan, without
 from fcslam.robot.track import ScanTrack
+from fcslam.warmup import made_up_scans
 from fcslam.wire.messages import Hello, Packet
 
 OLDEST_S = 2.0
@@ -27,6 +30,7 @@ SPEED_MPS = 0.5
 """By how much the place of a robot grows with the age of its pose."""
 WALL_CELLS = 2
 """A point so few cells from an occupied cell is of that wall."""
+FREE, OCCUPIED = int(Occupancy.FREE), int(Occupancy.OCCUPIED)
 MOST_DRAWN = 20_000
 """Most keyscans that wait to be drawn by the cloud: hours of an outage."""
 MOST_MET = 1000
@@ -54,6 +58,9 @@ class JointMap:
         self._met: dict[_ScanKey, NDArray[np.bool_]] = {}
         """Beams of the newest scans that hit other robots."""
         self._lock = threading.Lock()
+        (scan,), cell = made_up_scans(1), OccupancyMap(np.zeros((1, 1), np.uint8), 1.0, (0.0, 0.0))
+        here = scan.T_odom_base
+        beams_on_teammates(scan, here, here, here[None] * (1.0, 1.0, 0.0), cell, 1.0)  # no scan waits for the compiler
 
     def add(self, packets: Iterable[Packet]) -> None:
         """Keep the next keyscans until the cloud has drawn them."""
@@ -133,35 +140,31 @@ def beams_on_teammates(
         joint, radius_m: the joint map, and the radius of a robot.
     """
     T_map_base = se2.compose(T_map_before, se2.between(T_odom_before, scan.T_odom_base))
-    near = _near(T_map_base, places, radius_m, scan.laser.max_range_m)
-    if len(near) == 0:
+    limits_m = radius_m + SPEED_MPS * places[:, 2]
+    apart_m = np.hypot(*(places[:, :2] - T_map_base[:2]).T)
+    near = (places[:, 2] <= OLDEST_S) & (apart_m <= scan.laser.max_range_m + limits_m)
+    if not near.any():
         return None
-    origins, directions = rays_of(scan.laser, scan.sweep)
-    is_return = (scan.ranges_m > 0.0) & (scan.ranges_m < scan.laser.max_range_m)
-    points = origins + np.where(is_return, scan.ranges_m, 0.0)[:, None] * directions
-    apart2 = ((points[:, None] - near[:, :2]) ** 2).sum(axis=2)
-    found: NDArray[np.bool_] = is_return & (apart2 <= near[:, 2]).any(axis=1)
-    found[found] = _are_on_floor(se2.transform(T_map_base, points[found]), joint)
+    rays, reach_m = rays_of(scan.laser, scan.sweep), scan.laser.max_range_m
+    found = np.zeros(scan.laser.beam_count, np.bool_)
+    for place, limit_m in zip(places[near, :2], limits_m[near], strict=True):
+        hit, points = returns_near(scan.ranges_m, *rays, reach_m, T_map_base, place, place, limit_m)
+        found[hit] = _are_on_floor(points, joint.cells, joint.origin_xy, joint.resolution_m)
     return found if found.any() else None
 
 
-def _near(T_map_base: FloatArray, places: FloatArray, radius_m: float, reach_m: float) -> FloatArray:
-    """x and y in ``base``, and the squared radius, of the discs on which robots within reach may be, shape (K, 3)."""
-    x, y = (places[:, :2] - T_map_base[:2]).T
-    cos, sin = np.cos(T_map_base[2]), np.sin(T_map_base[2])
-    limit_m = radius_m + SPEED_MPS * places[:, 2]
-    discs = np.stack((cos * x + sin * y, cos * y - sin * x, limit_m**2), axis=-1)
-    near: FloatArray = discs[(places[:, 2] <= OLDEST_S) & (np.hypot(x, y) <= reach_m + limit_m)]
-    return near
-
-
-def _are_on_floor(points: FloatArray, joint: OccupancyMap) -> NDArray[np.bool_]:
+@njit
+def _are_on_floor(points, cells, origin_xy, side_m):  # type: ignore[no-untyped-def]
     """Whether points of a map, shape (N, 2), lie in a free cell without a wall beside it, shape (N,)."""
-    cells, reach = joint.cells, np.arange(-WALL_CELLS, WALL_CELLS + 1)
+    result = np.zeros(len(points), np.bool_)
     height, width = cells.shape
-    column, row = np.floor((points - joint.origin_xy) / joint.resolution_m).astype(np.int64).T
-    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    rows, columns = (row[:, None] + reach).clip(0, height - 1), (column[:, None] + reach).clip(0, width - 1)
-    around = cells[rows[:, :, None], columns[:, None]]
-    is_free = around[:, WALL_CELLS, WALL_CELLS] == Occupancy.FREE
-    return np.asarray(inside & is_free & ~(around == Occupancy.OCCUPIED).any(axis=(1, 2)))
+    for i in range(len(points)):
+        column = int(np.floor((points[i, 0] - origin_xy[0]) / side_m))
+        row = int(np.floor((points[i, 1] - origin_xy[1]) / side_m))
+        if not (0 <= row < height and 0 <= column < width):
+            continue
+        result[i] = cells[row, column] == FREE
+        for r in range(max(0, row - WALL_CELLS), min(height, row + WALL_CELLS + 1)):
+            for c in range(max(0, column - WALL_CELLS), min(width, column + WALL_CELLS + 1)):
+                result[i] &= cells[r, c] != OCCUPIED
+    return result

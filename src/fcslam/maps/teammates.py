@@ -93,9 +93,7 @@ def _suspects(
         scan = scans[k]
         origins, directions = rays_of(scan.laser, scan.sweep)
         reach_m = scan.laser.max_range_m
-        hit, at = _returns_near(
-            scan.ranges_m, origins, directions, reach_m, scan.T_map_base, begin[k], end[k], radius_m
-        )
+        hit, at = returns_near(scan.ranges_m, origins, directions, reach_m, scan.T_map_base, begin[k], end[k], radius_m)
         numbers.append(np.full(len(hit), k))
         beams.append(hit)
         points.append(at)
@@ -124,7 +122,7 @@ def _distance(points: FloatArray, begin: FloatArray, end: FloatArray) -> FloatAr
 
 
 @njit
-def _returns_near(ranges_m, origins, directions, reach_m, T_map_base, begin, end, radius_m):  # type: ignore[no-untyped-def]
+def returns_near(ranges_m, origins, directions, reach_m, T_map_base, begin, end, radius_m):  # type: ignore[no-untyped-def]
     """Beams whose returns lie within ``radius_m`` of the line between two points, and these returns in ``map``."""
     cos, sin = np.cos(T_map_base[2]), np.sin(T_map_base[2])
     along_x, along_y = end[0] - begin[0], end[1] - begin[1]
