@@ -2,10 +2,8 @@
 
 import getpass
 import os
-import re
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +12,6 @@ import typer
 
 from fcslam.cli.inputs import numbers
 from fcslam.cli.inputs import pose as read_pose
-from fcslam.cli.output import answers
 from fcslam.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,10 +29,6 @@ _NEGATIVE = {"ignore_unknown_options": True}
 _EVER_S = 1e12
 """Begins and ends a stretch without a stamp: no file of edits holds infinities."""
 
-_OPEN = None, -_EVER_S, _EVER_S
-"""Values that a list of edits leaves out."""
-_BELOW_MM = r"(?<=\.\d{3})\d+"
-
 Mission = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder or mission file.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder, in whose map you read the coordinates.")]
 MapIndex = Annotated[int, typer.Option("--map", min=0, help="Number of the map, as in map_1.png.")]
@@ -52,21 +45,52 @@ StampJ = Annotated[float, typer.Argument(metavar="STAMP_J", help="Seconds, of th
 @app.command("list")
 def list_edits(mission: Mission) -> None:
     """List all edits of a mission: number, time, author, change, and what undid it."""
-    from rich.table import Table
-    from rich.text import Text
-
     from fcslam.cloud.edits import undone
-    from fcslam.mission.edits import kind_of
+    from fcslam.config import one_line
     from fcslam.mission.mission_file import read_mission
 
-    edits, table = read_mission(mission).edits, Table("edit", "time", "author", "change", "undone by")
+    edits = read_mission(mission).edits
     gone = undone(edits)
     for edit in edits:
         when = f"{datetime.fromtimestamp(edit.time_s, UTC):%Y-%m-%d %H:%M:%S} UTC" if edit.time_s else "from the start"
-        values = ", ".join(f"{name} {value}" for name, value in asdict(edit.content).items() if value not in _OPEN)
-        change = f"{kind_of(edit.content)}: {re.sub(_BELOW_MM, '', values)}"
-        table.add_row(*map(Text, (str(edit.number), when, edit.author, change, str(gone.get(edit.number, "")))))
-    answers().print(table if edits else "no edits")
+        undoing = f"; undone by edit {gone[edit.number]}" if edit.number in gone else ""
+        typer.echo(f"{edit.number}: {_in_words(edit.content)} ({one_line(edit.author)}, {when}{undoing})")
+    if not edits:
+        typer.echo("no edits")
+
+
+def _in_words(content: "Change | Undo") -> str:
+    from fcslam.cloud.sessions import session_name
+    from fcslam.records import Cut, FloorLabel, ManualClosure, MapRegion, Pin, Placement, Removal, Undo, Veto
+
+    match content:
+        case Veto(i, j, stamps) | Pin(i, j, stamps):
+            ends = (i, j) if stamps is None else map(_moment, (i, j), stamps)
+            words = f"{' and '.join(ends)} are {'one place' if isinstance(content, Pin) else 'not the same place'}"
+        case ManualClosure(i, stamp_i, j, stamp_j, T_i_j):
+            words = f"{_moment(j, stamp_j)} is at {_pose(T_i_j)} seen from {_moment(i, stamp_i)}"
+        case Removal(robot, epoch):
+            words = f"remove {robot if epoch is None else session_name(robot, epoch)}"
+        case Cut(session, first_s, last_s):
+            begin = f" from {first_s:.3f} s" if first_s > -_EVER_S else ""
+            words = f"remove {session}{begin}" + (f" to {last_s:.3f} s" if last_s < _EVER_S else "")
+        case Placement(session, stamp, pose):
+            words = f"place the map: {_moment(session, stamp)} is at {_pose(pose)}"
+        case MapRegion(use, name, session, stamp, polygon):
+            words = f"{use}{name and f' {name}'}: {len(polygon)} corners around {_moment(session, stamp)}"
+        case FloorLabel(session, floor):
+            words = f"{session} is on floor {floor}"
+        case Undo(number):
+            words = f"undo edit {number}"
+    return words
+
+
+def _moment(session: str, stamp: float) -> str:
+    return f"{session} at {stamp:.3f} s"
+
+
+def _pose(pose: tuple[float, float, float]) -> str:
+    return "({:.3f} m, {:.3f} m, {:.3f} rad)".format(*pose)
 
 
 @app.command()
