@@ -1,16 +1,21 @@
 """Rooms import only rooms above them in the table of the architecture, and `import fcslam` is light."""
 
 import ast
+import itertools
+import re
 import subprocess
 import sys
+import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
 
 from tests.sources.carmen_text import drive
+from tests.test_supply_chain import normal
 
 PACKAGE = Path(__file__).parents[1] / "src" / "fcslam"
 
@@ -114,6 +119,19 @@ def test_every_room_is_known():
 
 def test_rooms_import_only_rooms_above(statements):
     assert [found for path, nodes in statements.items() for found in violations(nodes, path)] == []
+
+
+def test_packages_that_are_imported_are_declared(statements):
+    project = tomllib.loads((PACKAGE.parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = itertools.chain.from_iterable(project["optional-dependencies"].values())
+    declared = {normal(re.split(r"[^\w.-]", each)[0]) for each in (*project["dependencies"], *extras)}
+    of_module = packages_distributions()
+    for path, nodes in statements.items():
+        for node in nodes:
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and not node.level else []
+            for name in {name.split(".")[0] for name in names} - {"fcslam", *sys.stdlib_module_names}:
+                assert declared & set(map(normal, of_module.get(name, [name]))), f"{path} imports {name}"
 
 
 def test_no_module_imports_itself_through_others(statements):
