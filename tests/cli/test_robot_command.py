@@ -179,7 +179,7 @@ def test_a_live_robot_that_is_turned_away_does_not_lose_its_run(monkeypatch, tmp
 
     kinds = {"/scan": SCAN, "/odom": ODOMETRY}
     topics = SensorTopics(kinds, ("/scan",), "/odom", ("/tf", "/tf_static"))
-    monkeypatch.setattr("fcslam.cli.addresses.open_network", lambda *_: MemoryNetwork())
+    monkeypatch.setattr("fcslam.ros.node.open_network", lambda *_: MemoryNetwork())
     monkeypatch.setattr("fcslam.ros.node.await_sensors", lambda *_: topics)
     monkeypatch.setattr("fcslam.ros.node.RobotNode.run", run)
     start = partial(Turned, wiring=Wiring(SameThread()))

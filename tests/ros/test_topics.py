@@ -2,8 +2,9 @@
 
 import pytest
 
-from fcslam.cli.addresses import RosAddress, open_network, parse_address
+from fcslam.cli.addresses import RosAddress, parse_address
 from fcslam.errors import InputError
+from fcslam.ros.node import open_network
 from fcslam.ros.topics import choose_sensor_topics
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import (
@@ -115,7 +116,7 @@ def test_addresses():
 @pytest.mark.parametrize("domain", ["233", "-1"])
 def test_a_domain_out_of_range(domain):
     with pytest.raises(InputError, match="is not a ROS 2 domain"):
-        open_network(RosAddress("ros2", ""), {"ROS_DOMAIN_ID": domain})
+        open_network("ros2", {"ROS_DOMAIN_ID": domain})
 
 
 def test_a_topic_of_one_echo_a_beam_goes_before_one_of_several():

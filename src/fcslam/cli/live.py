@@ -61,10 +61,9 @@ def drive_live(
     """Run a live robot until it is stopped, and write the run to ``output``; ``start`` makes the robot.
     With a plan for ``learning``, it learns while it stands still.
     """
-    from fcslam.cli.addresses import open_network
     from fcslam.live.localized_robot import LocalizedRobot
     from fcslam.live.records import EventKind
-    from fcslam.ros.node import RobotNode, await_sensors
+    from fcslam.ros.node import RobotNode, await_sensors, open_network
     from fcslam.runs import prepare_output
     from fcslam.sources import IN_PLANE
 
@@ -79,7 +78,7 @@ def drive_live(
         if event.kind is not EventKind.CORRECTED:  # there are many
             notify(event.text)
 
-    with closing(open_network(live.address)) as network, ExitStack() as stack:
+    with closing(open_network(live.address.network)) as network, ExitStack() as stack:
         namespace = live.address.namespace
         topics = await_sensors(network, namespace, live.options, live.parameters.topic_timeout)
         for note in topics.notes:

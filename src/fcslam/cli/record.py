@@ -62,8 +62,7 @@ def record(
 
 
 def _record(live: "LiveSource", output: Path, duration: float | None, force: bool, console: "Console") -> None:
-    from fcslam.cli.addresses import open_network
-    from fcslam.ros.node import await_sensors
+    from fcslam.ros.node import await_sensors, open_network
     from fcslam.ros.record import record as record_messages
 
     place = live.address
@@ -71,7 +70,7 @@ def _record(live: "LiveSource", output: Path, duration: float | None, force: boo
         raise InputError(f"{output}: a recording of a live robot is a .mcap file; choose such a name")
     _prepare(output, force)
     stop = Event()
-    with closing(open_network(place)) as network:
+    with closing(open_network(place.network)) as network:
         found = await_sensors(network, place.namespace, live.options, live.parameters.topic_timeout)
         print_line(console, f"records {', '.join(found.kinds)}; Ctrl-C ends the recording")
         timer = Timer(duration or 0.0, stop.set)

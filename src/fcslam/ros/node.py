@@ -4,9 +4,10 @@ The thread that calls ``run`` reads messages. A second thread publishes ``map ->
 publishes the map, the path and diagnostics. So none of them delays the pose of a scan.
 """
 
+import os
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -40,7 +41,22 @@ _LINES_TOLD = 100
 _FLEET_PERIOD_S = 0.2
 """Time between two messages with the poses of the fleet."""
 _SETTLES_FOR_ODOMETRY = 4
+_LARGEST_DOMAIN = 232
 _DEPTHS = {**dict.fromkeys((*SCANS, COMPRESSED_IMAGE, IMAGE), 10), **dict.fromkeys(LASER_SCANS, 100), CAMERA_INFO: 1}
+
+
+def open_network(kind: str, environment: Mapping[str, str] = os.environ) -> RosNetwork:
+    """Join a network of ROS 2 over DDS (``ros2``) or over Zenoh (``zenoh``); its domain is ROS_DOMAIN_ID, or 0."""
+    text = environment.get("ROS_DOMAIN_ID") or "0"
+    if not text.isdecimal() or int(text) > _LARGEST_DOMAIN:
+        raise InputError(f"{text!r} is not a ROS 2 domain; give a number from 0 to {_LARGEST_DOMAIN}")
+    if kind == "zenoh":
+        from fcslam.ros.ros2_zenoh import ZenohNetwork
+
+        return ZenohNetwork(int(text), environment)
+    from fcslam.ros.ros2 import Ros2Network
+
+    return Ros2Network(int(text), environment)
 
 
 def await_sensors(
