@@ -116,6 +116,14 @@ def test_fixes_that_contradict_the_others_bend_nothing():
     assert off_m(placing, true, T).max() < 0.5
 
 
+def test_fixes_that_are_too_few_to_check_each_other_place_nothing():
+    """Three of them may agree and be wrong, as by one reflection."""
+    result, true = mapped()
+    placing = placed(fixed(result, fixes_of(true, (35.0, -20.0, 0.7), 0.05)[::9][:3]))
+    (line,) = (line for line in anchoring_lines(placing.files) if "earth" in line)
+    assert line.endswith("3 fixes do not show which are wrong, 10 needed; drive farther outdoors")
+
+
 def test_fixes_that_leave_the_heading_open_place_nothing():
     result, true = mapped()
     placing = placed(fixed(result, fixes_of(true, (0.0, 0.0, 0.0), 8.0)))
