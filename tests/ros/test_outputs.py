@@ -7,6 +7,7 @@ from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.records import frozen
 from fcslam.ros.clock import TransformStream
 from fcslam.ros.outputs import Outputs
+from fcslam.wire.fleet_replies import TeammatePose
 from tests.ros.memory_network import MemoryNetwork
 
 SECOND = 10**9
@@ -47,6 +48,19 @@ def test_closures_and_diagnostics(network, published):
     (array,) = network.sent["/diagnostics"]
     assert array.status[0].name == "fcslam: anna"
     assert (array.status[0].level, array.status[0].message) == (1, "lost")
+
+
+def test_two_robots_never_share_a_topic(network, published):
+    mates = [
+        TeammatePose(robot=name, map=0, floor="", pose=(x, 0.0, 0.0), age_s=0.0, stamp=0.0)
+        for name, x in (("r-2", 1.0), ("r_2", 2.0))
+    ]
+    for turn in (mates, mates[::-1], mates[1:]):
+        published.fleet(1, turn, 0)
+    assert [pose.pose.position.x for pose in network.sent["/robot1/fleet/r_2/pose"]] == [1.0, 1.0]
+    said = {status.name: (status.level, status.message) for status in network.sent["/robot1/fleet/status"][0].status}
+    assert said["robot r-2"] == (0, "map 0")
+    assert said["robot r_2"] == (1, "map 0; fleet/r_2/pose has the poses of r-2: rename one of both")
 
 
 @pytest.mark.parametrize(("length_m", "count", "least", "most"), [(1.0, 101, 8, 12), (1000.0, 20_001, 3900, 5200)])

@@ -69,7 +69,8 @@ class Outputs:
         self._publishers: dict[str, Publish] = {}
         """By topic; new ones are made under the lock."""
         self._maps: dict[str, OccupancyMap] = {}
-        self._teammates: set[str] = set()
+        self._teammates: dict[str, str] = {}
+        """Robots by the topics of their poses."""
         self._goal_xy: FloatArray = np.full(2, np.nan)
         for topic, kind, quality in (
             (MAP, GRID, LATCHED),
@@ -191,18 +192,21 @@ class Outputs:
         header = self._codec.header(now_ns, self._map_frame)
         self._send(FLEET_POSES, POSES, self._codec.make(POSES, header=header, poses=poses))
         for mate in near:
-            topic = f"fleet/{_topic_name(mate.robot)}/pose"
-            if topic not in self._teammates and len(self._teammates) >= MOST_TEAMMATES:
-                continue
-            self._teammates.add(topic)
-            stamp_ns = max(0, now_ns - nanoseconds(mate.age_s))
-            self._send(topic, POSE_STAMPED, self._posed(stamp_ns, np.array(mate.T_map_base)))
+            topic = _pose_topic(mate.robot)
+            if len(self._teammates) < MOST_TEAMMATES:
+                self._teammates.setdefault(topic, mate.robot)
+            if self._teammates.get(topic) == mate.robot:
+                stamp_ns = max(0, now_ns - nanoseconds(mate.age_s))
+                self._send(topic, POSE_STAMPED, self._posed(stamp_ns, np.array(mate.T_map_base)))
         statuses = []
         for mate in teammates:
             values: dict[str, object] = {"map": mate.map_index, "floor": mate.floor, "age_s": f"{mate.age_s:.2f}"}
             values |= {axis: f"{at:.4f}" for axis, at in zip(("x", "y", "theta"), mate.T_map_base, strict=True)}
-            name, where = f"robot {mate.robot}", f"map {mate.map_index}"
-            statuses.append(self._status(name, mate.robot, self._levels.OK, where, values))
+            name, where, level = f"robot {mate.robot}", f"map {mate.map_index}", self._levels.OK
+            owner = self._teammates.get(topic := _pose_topic(mate.robot), mate.robot)
+            if owner != mate.robot:  # as r-2 and r_2
+                where, level = f"{where}; {topic} has the poses of {owner}: rename one of both", self._levels.WARN
+            statuses.append(self._status(name, mate.robot, level, where, values))
         self._diagnose(FLEET_STATUS, now_ns, statuses)
 
     def diagnostics(self, stamp_ns: int, robot: str, trouble: str, values: Mapping[str, object], well: str) -> None:
@@ -264,10 +268,10 @@ def _is_same(before: OccupancyMap, after: OccupancyMap) -> bool:
     return is_in_place and np.array_equal(before.cells, after.cells)
 
 
-def _topic_name(robot: str) -> str:
-    """A robot's name as part of a topic; ROS allows letters, digits and underscores there, and no digit first."""
+def _pose_topic(robot: str) -> str:
+    """The topic of a robot's poses; ROS allows letters, digits and underscores in its name, and no digit first."""
     name = "".join(one if one.isascii() and one.isalnum() else "_" for one in robot)
-    return f"_{name}" if name[:1].isdigit() else name
+    return f"fleet/{'_' * name[:1].isdigit()}{name}/pose"
 
 
 def nanoseconds(stamp: float) -> int:
