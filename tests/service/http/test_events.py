@@ -1,7 +1,10 @@
 """The stream of events: it never falls silent, and ends with the token or the service."""
 
+import threading
+
 import pytest
 
+from fcslam.service.http.state import EventStream
 from tests.service.http.desk import ENTRIES, Desk
 
 
@@ -38,3 +41,26 @@ def test_a_stream_ends_with_the_service(desk):
         next(lines)
         desk.state.close()
         assert {*lines} <= {": nothing new", ""}
+
+
+class _Interrupted(dict):
+    """A dictionary whose first reader is overtaken by ``other``."""
+
+    def __init__(self, other):
+        self.other = threading.Thread(target=other)
+
+    def get(self, *key):
+        found = super().get(*key)
+        if self.other.ident is None:
+            self.other.start()
+            self.other.join(0.2)
+        return found
+
+
+def test_of_two_that_publish_at_once_none_is_lost():
+    """As of the supervisors of a mission that was closed and opened again."""
+    events = EventStream()
+    events._newest = _Interrupted(lambda: events.publish("result", 2))
+    events.publish("closed", 1)
+    events._newest.other.join()
+    assert {kind: number for kind, (_, number) in events.newest().items()} == {"closed": 1, "result": 2}

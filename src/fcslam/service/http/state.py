@@ -40,10 +40,12 @@ class EventStream:
         self._current, self.beat_s = current, beat_s
         self._newest: dict[str, dict[str, tuple[int, int]]] = {}
         self._counter = itertools.count()
+        self._lock = threading.Lock()
 
     def publish(self, kind: str, number: int, mission: str = "") -> None:
         """Tell all who watch a mission."""
-        self._newest[mission] = {**self._newest.get(mission, {}), kind: (next(self._counter), number)}
+        with self._lock:
+            self._newest[mission] = {**self._newest.get(mission, {}), kind: (next(self._counter), number)}
 
     def newest(self) -> dict[str, tuple[int, int]]:
         """By kind, which of all events the newest one of the current mission is, and its number."""
