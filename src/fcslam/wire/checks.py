@@ -1,6 +1,7 @@
 """Validation of packets: the same checks before writing and after reading."""
 
 import math
+from functools import cache
 from operator import attrgetter
 from typing import Any
 
@@ -26,6 +27,7 @@ from fcslam.records import (
     Sweep,
     TagSighting,
     VoxelMap,
+    frozen,
 )
 from fcslam.wire import limits
 from fcslam.wire.messages import Acknowledgement, DetectorUpdate, Hello, Packet
@@ -170,36 +172,28 @@ def _check_sweep(sweep: Sweep) -> None:
 
 
 def _check_information(information: FloatArray, what: str, freedom: int = 3) -> None:
-    """Refuse a matrix that is not symmetric or, as rounded and with a unit diagonal, not clearly positive definite.
-
-    In plain numbers: arrays take longer for the many matrices (3, 3), which come one by one.
-    """
+    """Refuse a matrix that is not symmetric or, as rounded and with a unit diagonal, not clearly positive definite."""
     _check_shape(information, (freedom, freedom), f"{what}: information")
     sent = pack_information(information)
     _require(all(map(math.isfinite, sent)), f"{what}: information is not finite")
-    rounded, axes = unpack_information(sent).tolist(), range(freedom)
-    diagonal = [rounded[k][k] for k in axes]
-    bounded = all(limits.MINIMUM_INFORMATION <= number <= limits.MAXIMUM_INFORMATION for number in diagonal)
+    rounded, given = unpack_information(sent), information.tolist()
+    rows = rounded.tolist()
+    diagonal = [row[k] for k, row in enumerate(rows)]
+    bounded = min(diagonal) >= limits.MINIMUM_INFORMATION and max(diagonal) <= limits.MAXIMUM_INFORMATION
     _require(bounded, f"{what}: a diagonal element of information is not in [2^-20, 2^40]")
-    scale = [1.0 / math.sqrt(number) for number in diagonal]
-    for given, row, scale_i in zip(information.tolist(), rounded, scale, strict=True):
-        symmetric = all(abs(given[k] - row[k]) * scale_i * scale[k] <= 1e-6 for k in axes)
-        _require(symmetric, f"{what}: information is not symmetric")
-    correlations = [[row[k] * scale_i * scale[k] for k in axes] for row, scale_i in zip(rounded, scale, strict=True)]
-    _require(_are_definite(correlations), f"{what}: information is not clearly positive definite")
+    lower = [(given[k][j] - rows[k][j], diagonal[k] * diagonal[j]) for k in range(freedom) for j in range(k)]
+    symmetric = all(off * off <= 1e-12 * scale2 for off, scale2 in lower)  # the upper triangle is sent
+    _require(symmetric, f"{what}: information is not symmetric")
+    try:
+        np.linalg.cholesky(rounded * _without_least(freedom))
+    except np.linalg.LinAlgError:
+        raise PacketError(f"{what}: information is not clearly positive definite") from None
 
 
-def _are_definite(correlations: list[list[float]]) -> bool:
-    """Whether a symmetric matrix has no eigenvalue below the limit: less that, all pivots of its elimination are
-    positive. Changes the matrix."""
-    for k, row in enumerate(correlations):
-        row[k] -= limits.MINIMUM_CORRELATION_EIGENVALUE
-        if not row[k] > 0.0:
-            return False
-        for below in correlations[k + 1 :]:
-            share = below[k] / row[k]
-            below[k:] = [number - share * above for number, above in zip(below[k:], row[k:], strict=True)]
-    return True
+@cache
+def _without_least(freedom: int) -> FloatArray:
+    """Factors (d, d) that take the least eigenvalue off a matrix that has a unit diagonal, and as much off others."""
+    return frozen(1.0 - limits.MINIMUM_CORRELATION_EIGENVALUE * np.eye(freedom))
 
 
 def _check_voxel_map(local: VoxelMap) -> None:
