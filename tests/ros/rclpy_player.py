@@ -88,7 +88,7 @@ class Driver:
             self.publish_odometry(stamp, pose)
             self.spin_while(lambda due=due + duration_s: time.monotonic() < due, LONGEST_WAIT_S)
             self.publish_scan(stamp, ranges, laser, beam_s)
-        self.spin_while(lambda: self.sent, 2.0)
+        self.spin_while(lambda: self.sent, LONGEST_WAIT_S)
 
     def publish_odometry(self, stamp, pose):
         reading = stamped(Odometry(), stamp, "odom")

@@ -3,6 +3,7 @@
 import threading
 import time
 from contextlib import contextmanager
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 from fcslam.ros.node import EMPTY, FINISH, FLOOR, INITIAL_POSE, STRING, RobotNode, await_sensors
 from fcslam.ros.outputs import POSE
 from fcslam.ros.parameters import NodeParameters
-from fcslam.ros.sensors import STEPS_BACK_FOR_RESTART
+from fcslam.ros.sensors import ODOMETRY_PATIENCE_S, STEPS_BACK_FOR_RESTART
 from fcslam.sources import BagOptions
 from fcslam.sources.bags.codec import ODOMETRY, POINT_CLOUD, SCAN, TRANSFORMS
 from fcslam.sources.bags.transforms import in_space
@@ -91,6 +92,27 @@ def test_every_scan_gets_a_pose_and_the_map_is_published(network, robot, scans):
     assert grid.header.frame_id == "map"
     (path,) = network.sent["/robot1/path"]
     assert path.poses[0].header.stamp.sec == int(scans[0].stamp)
+
+
+def test_odometry_that_a_slow_robot_has_not_read_yet_is_not_late(network, robot, scans):
+    """Each reading comes after the scan that follows it, as one of a scanner that spins; one scan takes long to map."""
+    node, laser, found = start(network, robot), scans[0].laser, []
+    network.say("/tf_static", TRANSFORMS, transform(0.0, "base_link", "laser", laser.T_base_laser))
+    for before, record in pairwise(scans):
+        seen = scan(record.stamp, record.ranges_m, "laser", *laser.beams[1:], laser.max_range_m)
+        network.say("/robot1/scan", SCAN, seen)
+        network.say("/robot1/odom", ODOMETRY, odometry(before.stamp, before.T_odom_base))
+
+    def watch(count, pose):
+        found.append(pose.T_odom_base)
+        if count == len(scans) - 9:
+            time.sleep(1.1 * ODOMETRY_PATIENCE_S)
+        if count == len(scans) - 3:
+            node.stop()
+
+    node.run(watch)
+    expected = [scan.T_odom_base for scan in scans[1:]]
+    np.testing.assert_allclose(found, expected[: len(found)], atol=1e-6)
 
 
 def test_map_to_odom_carries_the_frame_of_the_odometry(network, robot, scans):

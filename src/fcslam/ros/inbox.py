@@ -28,6 +28,9 @@ class ReceivedMessage(NamedTuple):
     topic: str
     payload: bytes
     received_ns: int
+    """By the clock of ROS."""
+    arrived_s: float
+    """By a clock that only grows, however long the message then waited to be read."""
 
 
 class Inbox:
@@ -87,7 +90,7 @@ class Inbox:
         if is_lost:
             self._notify("messages come faster than this computer can map; some are lost")
         else:
-            self._messages.put(ReceivedMessage(topic, payload, now_ns()))
+            self._messages.put(ReceivedMessage(topic, payload, now_ns(), self._clock()))
 
     def __len__(self) -> int:
         """Number of messages that wait."""

@@ -44,7 +44,7 @@ def record(
             file = place / f"{place.name}.mcap"
             try:
                 writer.open()
-                for topic, payload, received_ns in _messages(inbox, stop):
+                for topic, payload, received_ns, _ in _messages(inbox, stop):
                     if topic not in connections:
                         name = full_name(kinds[topic])
                         connections[topic] = writer.add_connection(topic, name, typestore=typestore(ros1=False))
