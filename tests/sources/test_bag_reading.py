@@ -94,8 +94,9 @@ def test_parts_and_copies_are_read_side_by_side(tmp_path, name):
 
 def test_memory_does_not_grow_with_the_recording(tmp_path):
     short, long = (save(tmp_path / f"{scans}.db3", drive(scans)) for scans in (600, 1500))
-    peak_of(open_source(short))
-    assert peak_of(open_source(long)) < 1.2 * peak_of(open_source(short)) + 20_000
+    # Of several passes, the least: threads of other tests, and modules that load at the first use, take memory as well.
+    short_bytes, long_bytes = (min(peak_of(open_source(path)) for _ in range(3)) for path in (short, long))
+    assert long_bytes < 1.2 * short_bytes + 20_000
 
 
 def test_odometry_at_the_scans_stamp_is_the_scans_to_the_last_bit(tmp_path):
