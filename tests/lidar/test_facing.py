@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from tests.live.same_thread import SameThread
 
 pytestmark = pytest.mark.slow
 
+SAMPLE_LOG = Path(__file__).parents[2] / "examples" / "logs" / "anna.clf.xz"
 NARROW = LaserModel(91, -math.pi / 2, math.radians(2.0), 5.0, (0.2, 0.05, 0.0))
 WIDE = LaserModel(180, -math.pi, math.radians(2.0), 12.0, (0.2, 0.05, 0.0))
 
@@ -138,6 +140,14 @@ def test_a_bag_whose_tf_is_wrong_is_read_as_the_laser_faces(tmp_path, turned_deg
     kept = calibrated(open_source(path, given), LidarConfig())
     assert "--sensors laser-pose is kept" in " ".join(kept.survey().notes)
     assert kept.survey().lasers[0].T_base_laser == given.laser_poses[0]
+
+
+def test_a_pose_that_the_user_gives_is_kept_where_the_motion_shows_another(tmp_path):
+    write_bag(tmp_path / "anna.bag", open_source(SAMPLE_LOG).records())
+    given = (0.12, 0.0, 0.0)  # the log says 0.05 m
+    kept = calibrated(open_source(tmp_path / "anna.bag", BagOptions(laser_poses=(given,))), LidarConfig()).survey()
+    assert kept.lasers[0].T_base_laser == given
+    assert kept.notes[-1].endswith("along y from where it is stated; --sensors laser-pose is kept")
 
 
 @pytest.mark.parametrize(("turned_deg", "upside_down"), [(180, False), (0, True)])

@@ -214,7 +214,8 @@ def _calibrate_finely(bag: "RosBag", config: LidarConfig) -> Calibrated:
     if _is_wrong(distance := calibration.distance_scale) and not _is_of_wheels(distance):
         calibration = replace(calibration, mounting=None)  # in which unit, is not known
     assumed = float(np.median(motions.first_s)), float(np.median(motions.last_s))
-    found = _corrected(calibration, assumed, _stated_share(bag.plan.stated_sweep, assumed_s))
+    done = "--sensors laser-pose is kept" if bag.options.laser_poses else "used"
+    found = _corrected(calibration, assumed, _stated_share(bag.plan.stated_sweep, assumed_s), done)
     sweep = found.correction.sweep
     if sweep is not None and bag.is_upside_down:  # the beams of the message are in the opposite order
         found = replace(found, correction=replace(found.correction, sweep=sweep[::-1]))
@@ -358,13 +359,14 @@ def _unwrapped(poses: FloatArray) -> FloatArray:
     return known
 
 
-def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], nominal: float) -> Calibrated:
+def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], nominal: float, done: str) -> Calibrated:
     """The significant estimates as a correction and in words.
 
     Args:
         calibration: the estimates.
         assumed: times of the first and the last beam after the stamp with which the scans were tracked, seconds.
         nominal: duration of a scan as the bag states it, per assumed duration; 0: all beams at once.
+        done: what becomes of the estimated mounting.
     """
     if calibration.mounting is not None:
         x, y, _ = calibration.mounting
@@ -374,7 +376,7 @@ def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], nom
     is_late = calibration.delay is not None and calibration.delay.differs(0.0, LEAST_DELAY_S)
     is_other = share is not None and share.differs(nominal, LEAST_SHARE)
     if not is_late and not is_other:
-        return _mounted(calibration, BagCorrection(), [])
+        return _mounted(calibration, BagCorrection(), [], done)
     delay_s = calibration.delay.value if calibration.delay is not None and is_late else 0.0
     taken = nominal
     if share is not None and is_other:
@@ -400,7 +402,7 @@ def _corrected(calibration: MotionCalibration, assumed: tuple[float, float], nom
             if first_s == last_s
             else f"a scan {duration}, and its stamp is that of the {where} beam; used"
         )
-    return _mounted(calibration, correction, lines)
+    return _mounted(calibration, correction, lines, done)
 
 
 def _share(calibration: MotionCalibration) -> Estimate | None:
@@ -417,7 +419,7 @@ def _stamped(first_s: float, last_s: float) -> str | None:
     return next((where for where, time_s in times if abs(time_s) <= STAMP_TOLERANCE_S), None)
 
 
-def _mounted(calibration: MotionCalibration, correction: BagCorrection, lines: list[str]) -> Calibrated:
+def _mounted(calibration: MotionCalibration, correction: BagCorrection, lines: list[str], done: str) -> Calibrated:
     if calibration.mounting is None:
         return Calibrated(calibration, correction, tuple(lines))
     x, y, yaw = calibration.mounting
@@ -426,13 +428,13 @@ def _mounted(calibration: MotionCalibration, correction: BagCorrection, lines: l
         side = "left" if yaw.value > 0.0 else "right"
         lines.append(
             f"the laser is mounted {math.degrees(abs(yaw.value)):.1f} deg (+- {math.degrees(yaw.sigma):.1f}) to the "
-            f"{side} of what tf says; used"
+            f"{side} of what is stated; {done}"
         )
         moved[2] = yaw.value
     if x.differs(0.0, LEAST_OFFSET_M) or y.differs(0.0, LEAST_OFFSET_M):
         lines.append(
             f"the laser is mounted {x.value:+.2f} m (+- {x.sigma:.2f}) along x and {y.value:+.2f} m (+- {y.sigma:.2f}) "
-            "along y from where tf says; used"
+            f"along y from where it is stated; {done}"
         )
         moved[0], moved[1] = x.value, y.value
     return Calibrated(calibration, replace(correction, mounting=(moved[0], moved[1], moved[2])), tuple(lines))
