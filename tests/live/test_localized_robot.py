@@ -152,7 +152,7 @@ def test_a_map_that_cannot_be_used_is_refused_in_one_line(building, scans, tmp_p
 def test_a_mission_file_is_a_map(fleet, tmp_path):
     write_carmen(tmp_path / "anna.clf", list(fleet.robots[0].scans())[:60])
     fcslam.map_recordings(tmp_path / "anna.clf", output=tmp_path / "run")
-    moved = (tmp_path / "run" / "mission.fcslam").rename(tmp_path / "office.fcslam")
+    moved = (tmp_path / "run" / "mission.fcslam").rename(tmp_path / "office.sqlite")  # as a service exports it
     assert np.array_equal(read_map(moved).cells, read_map(tmp_path / "run").cells)
 
 

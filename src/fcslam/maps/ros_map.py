@@ -51,8 +51,8 @@ def read_ros_map(path: Path) -> OccupancyMap:
         return parse_ros_map(str(path), read_bytes(_image_of(path, image)), text)
     except OSError as error:
         raise SourceError(
-            f"{one_line(str(error.filename))}: cannot be read as a map ({error.strerror}); give a run folder or "
-            "a map.yaml"
+            f"{one_line(str(error.filename or path))}: cannot be read as a map ({error.strerror or error}); give a run "
+            "folder or a map.yaml"
         ) from error
     except (KeyError, TypeError, ValueError) as error:
         raise SourceError(f"{path}: names no image; give a run folder or the YAML file of a map") from error

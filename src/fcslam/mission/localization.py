@@ -26,7 +26,7 @@ from fcslam.maps.occupancy_map import OccupancyMap, map_stem, parse_map, server_
 from fcslam.maps.ros_map import read_ros_map
 from fcslam.mission.driving import SCANS_PER_LEG, front_end_of
 from fcslam.mission.mission import MissionConfig, MissionInputs, continued_config, run_mission
-from fcslam.mission.mission_file import read_mission
+from fcslam.mission.mission_file import is_mission, read_mission
 from fcslam.records import FloatArray, LaserScan, checked_pose, frozen
 from fcslam.robot.frontend import RobotFrontend
 from fcslam.robot.map_localizer import MapEstimate, MapLocalizer
@@ -76,7 +76,7 @@ def read_finished(path: Path, floor: str = "") -> FinishedMap:
 
     Name the floor where the run has several, because they may look the same.
     """
-    if path.suffix == Path(MISSION).suffix:
+    if path.suffix == Path(MISSION).suffix or (os.path.isfile(path) and is_mission(path)):
         return _mission_map(path, floor)
     if os.path.isfile(path / ROBOTS):
         number, floor = _map_on(floor, _floors(path), path)

@@ -170,11 +170,15 @@ def mission_path(path: Path) -> Path:
     path = path / MISSION if os.path.isdir(path) else path
     if not os.path.exists(path):
         raise SourceError(f"{path}: no such file; `fcslam map` writes {MISSION} into each run folder")
-    with translate_errors(path), open_file(path) as file:
-        start = file.read(len(_SQLITE))
-    if start not in (_SQLITE, b""):
+    if os.path.getsize(path) and not is_mission(path):
         raise SourceError(f"{path}: not a mission file; `fcslam map` writes {MISSION} into each run folder")
     return path
+
+
+def is_mission(path: Path) -> bool:
+    """Whether a file is a database, as mission files are under any name."""
+    with translate_errors(path), open_file(path) as file:
+        return file.read(len(_SQLITE)) == _SQLITE
 
 
 @contextmanager
