@@ -496,7 +496,7 @@ class ReasonCode(StrEnum):
 
     FOUND_BY_ROBOT = "found_by_robot", "found by the robot"
     VERIFIED = "verified", "passes the geometric verification"
-    FITS_JOINT_MAP = "fits_joint_map", "fits the joint map: {value} m off, less than {limit}"
+    FITS_JOINT_MAP = "fits_joint_map", "fits the joint map: {value} m off, less than {limit} m"
     IN_CLUSTER = "in_dominant_cluster", "in the dominant cluster of {value} closures"
     FITS_JOINT_GRAPH = "fits_joint_graph", "fits the joint graph"
     SAME_TAG = "same_tag", "both saw the same tag, number {value}"

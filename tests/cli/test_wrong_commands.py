@@ -127,7 +127,7 @@ WRONG = [
     ("edit remove run nobody", "there is no session 'nobody'; there are r", "edit remove run r"),
     ("edit remove r run", "r: no such file", "edit remove run r"),
     ("edit undo run 3", "there is no edit 3; `fcslam edit list` shows all 0", "edit list run"),
-    ("tools changes run --since yesterday", "neither a session nor a stamp in seconds nor a date such as", ""),
+    ("tools changes run --since yesterday", "neither a session of this map, a stamp in seconds nor a date such as", ""),
     ("localize r.log --map pic.png -o out", "give a run folder or the YAML file of a map", ""),
     ("localize r.log --map nowhere -o out", "nowhere: cannot be read as a map", "localize r.log --map run -o out"),
     ("localize run --map r.log -o out", "give a run folder", "localize r.log --map run -o out"),

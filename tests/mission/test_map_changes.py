@@ -114,7 +114,7 @@ def test_a_folder_is_replaced_with_force_only_and_only_if_it_holds_changes(three
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"since": "tuesday"}, "'tuesday': neither a session nor a stamp in seconds nor a date"),
+        ({"since": "tuesday"}, "'tuesday': neither a session of this map, a stamp in seconds nor a date"),
         ({"since": "nan"}, "neither a session"),
         ({"since": "2020-01-01"}, "no session had ended by then; the first is anna "),
         ({"since": "anna+2"}, "nothing to compare: no session between anna"),

@@ -149,7 +149,8 @@ def _stamp(option: str, text: str) -> float:
             moment = datetime.fromisoformat(text)
         except ValueError as error:
             raise SourceError(
-                f"--{option} {text[:100]!r}: neither a session nor a stamp in seconds nor a date such as 2026-11-23"
+                f"--{option} {text[:100]!r}: neither a session of this map, a stamp in seconds nor a date such as "
+                "2026-11-23"
             ) from error
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
