@@ -20,6 +20,8 @@ FOLDER = "files"
 SCRIPT = re.compile(r"python (benchmarks/\w+\.py)")
 INLINE = re.compile(r"(?<!<pre>)(?<!</span>)<code>[^<]*</code>")
 WORD = re.compile(r"(?<![^\s>])[^\s<>]+")
+BLOCK = re.compile(r'<div class="language-(?:sh|text)\b.*?</div>', re.DOTALL)
+OPTION = re.compile(r"(?<![^\s>])-[^\s<>]+")
 LONGEST_WORD = 20
 SETTING = re.compile(r"^- (command|date|versions): (.*)$", re.MULTILINE)
 COMMIT = re.compile(r"\(([0-9a-f]{7,})")
@@ -83,11 +85,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:  # noqa: ARG001
     """Let code in the text break where a reader expects it."""
+    html = BLOCK.sub(lambda code: OPTION.sub(breakable, code[0]), html)
     return INLINE.sub(lambda code: WORD.sub(breakable, code[0].replace("\\|", "|")), html)
 
 
 def breakable(word: re.Match[str]) -> str:
     """A word of code in HTML: left alone, a browser breaks ``--option`` behind its hyphens, and a long path nowhere."""
     if len(word[0]) > LONGEST_WORD and not word[0].startswith("-"):
-        return re.sub(r"[/_.|](?=\w)", r"\g<0><wbr>", word[0])
+        return re.sub(r"[/_.|](?=\w\w)", r"\g<0><wbr>", word[0])
     return f'<span class="word">{word[0]}</span>' if "-" in word[0] else word[0]

@@ -16,7 +16,7 @@ pytest.importorskip("material", reason="no MkDocs: make docs")
 pytest.importorskip("mkdocstrings_handlers.python", reason="no mkdocstrings: make docs")
 
 ROOT = Path(__file__).parents[2]
-PAGES = ("index", "start/first-map", "concepts/places", "troubleshooting", "reference/commands", "results/mapping")
+PAGES = ("index", "start/first-map", "howto/three-d", "troubleshooting", "reference/commands", "results/mapping")
 
 CUT_WORDS = """() => [...document.querySelectorAll("article code .word")]
     .filter((word) => word.getClientRects().length > 1).map((word) => word.textContent)"""
