@@ -122,6 +122,7 @@ class ProgressDisplay:
 
     def _line(self, task: Task) -> str:
         left = self._left.render(task).plain
-        stage = f"{task.description} {self._count.render(task).plain.strip()}"
-        told = stage, self._elapsed.render(task).plain, f"{left} left" if left else "", task.fields["details"]
+        count = self._count.render(task).plain.strip() if task.total or task.completed else ""
+        stage, elapsed = f"{task.description} {count}".strip(), self._elapsed.render(task).plain
+        told = stage, elapsed, f"{left} left" if left else "", task.fields["details"]
         return ", ".join(filter(None, told))
