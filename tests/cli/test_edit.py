@@ -123,16 +123,16 @@ def test_each_command_makes_its_edit_and_changes_nothing_else(mapped, run, capsy
     assert main(["edit", "list", str(run)]) == 0
     listed = re.sub(r" \(anna, .*|-?\d+\.\d{3}", "", capsys.readouterr().out)
     assert listed.splitlines() == [
-        "1: robot_1 at  s and robot_2 at  s are not the same place",
-        "2: robot_1 at  s and robot_2 at  s are one place",
-        "3: robot_2 at  s is at ( m,  m,  rad) seen from robot_1 at  s",
-        "4: remove robot_2",
-        "5: remove robot_1 from  s",
-        "6: erase: 3 corners around robot_2 at  s",
-        "7: free: 3 corners around robot_2 at  s",
-        "8: keep-out: 3 corners around robot_2 at  s",
-        "9: area Room 12: 3 corners around robot_2 at  s",
-        "10: place the map: robot_1 at  s is at ( m,  m,  rad)",
+        "1: veto: robot_1 at  s and robot_2 at  s",
+        "2: pin: robot_1 at  s and robot_2 at  s",
+        "3: closure: robot_1 at  s and robot_2 at  s: ( m,  m,  rad)",
+        "4: removal: robot_2",
+        "5: cut: robot_1 from  s",
+        "6: region: erase, 3 corners, by robot_2 at  s",
+        "7: region: free, 3 corners, by robot_2 at  s",
+        "8: region: keep-out, 3 corners, by robot_2 at  s",
+        "9: region: area Room 12, 3 corners, by robot_2 at  s",
+        "10: placement: robot_1 at  s: ( m,  m,  rad)",
     ]
 
 
@@ -164,9 +164,9 @@ def test_the_list_says_who_did_what_and_what_was_undone(run, capsys):
     assert main(["edit", "list", str(run)]) == 0
     shown = capsys.readouterr().out
     assert re.sub(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC", "NOW", shown).splitlines() == [
-        f"1: {first} and {second} are not the same place (anna, NOW; undone by edit 2)",
-        "2: undo edit 1 (anna, NOW)",
-        f"3: remove {first} from {start:.3f} s (anna, NOW)",
+        f"1: veto: {first} and {second} (anna, NOW; undone by edit 2)",
+        "2: undo: edit 1 (anna, NOW)",
+        f"3: cut: {first} from {start:.3f} s (anna, NOW)",
     ]
 
 

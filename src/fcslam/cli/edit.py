@@ -60,37 +60,28 @@ def list_edits(mission: Mission) -> None:
 
 
 def _in_words(content: "Change | Undo") -> str:
+    from fcslam.cloud.edits import stamps_of
     from fcslam.cloud.sessions import session_name
-    from fcslam.records import Cut, FloorLabel, ManualClosure, MapRegion, Pin, Placement, Removal, Undo, Veto
+    from fcslam.mission.edits import kind_of, sessions_of
+    from fcslam.records import Cut, FloorLabel, ManualClosure, MapRegion, Placement, Removal, Undo
 
+    moments = [f"{session} at {stamp:.3f} s" for session, stamp in stamps_of(content)]
+    words = " and ".join(moments or sessions_of(content))
     match content:
-        case Veto(i, j, stamps) | Pin(i, j, stamps):
-            ends = (i, j) if stamps is None else map(_moment, (i, j), stamps)
-            words = f"{' and '.join(ends)} are {'one place' if isinstance(content, Pin) else 'not the same place'}"
-        case ManualClosure(i, stamp_i, j, stamp_j, T_i_j):
-            words = f"{_moment(j, stamp_j)} is at {_pose(T_i_j)} seen from {_moment(i, stamp_i)}"
-        case Removal(robot, epoch):
-            words = f"remove {robot if epoch is None else session_name(robot, epoch)}"
-        case Cut(session, first_s, last_s):
-            begin = f" from {first_s:.3f} s" if first_s > -_EVER_S else ""
-            words = f"remove {session}{begin}" + (f" to {last_s:.3f} s" if last_s < _EVER_S else "")
-        case Placement(session, stamp, pose):
-            words = f"place the map: {_moment(session, stamp)} is at {_pose(pose)}"
-        case MapRegion(use, name, session, stamp, polygon):
-            words = f"{use}{name and f' {name}'}: {len(polygon)} corners around {_moment(session, stamp)}"
-        case FloorLabel(session, floor):
-            words = f"{session} is on floor {floor}"
-        case Undo(number):
-            words = f"undo edit {number}"
-    return words
-
-
-def _moment(session: str, stamp: float) -> str:
-    return f"{session} at {stamp:.3f} s"
-
-
-def _pose(pose: tuple[float, float, float]) -> str:
-    return "({:.3f} m, {:.3f} m, {:.3f} rad)".format(*pose)
+        case ManualClosure(T_i_j=pose) | Placement(pose=pose):
+            words += ": ({:.3f} m, {:.3f} m, {:.3f} rad)".format(*pose)
+        case MapRegion():
+            words = f"{' '.join(filter(None, (content.use, content.name)))}, {len(content.polygon)} corners, by {words}"
+        case Removal() if content.epoch is not None:
+            words = session_name(content.robot, content.epoch)
+        case Cut():
+            words += f" from {content.first_s:.3f} s" if content.first_s > -_EVER_S else ""
+            words += f" to {content.last_s:.3f} s" if content.last_s < _EVER_S else ""
+        case FloorLabel():
+            words += f" is on {content.floor}"
+        case Undo():
+            words = f"edit {content.number}"
+    return f"{kind_of(content)}: {words}"
 
 
 @app.command()
