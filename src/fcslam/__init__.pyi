@@ -15,6 +15,7 @@ from fcslam.errors import PacketError as PacketError
 from fcslam.errors import SourceError as SourceError
 from fcslam.errors import StoreError as StoreError
 from fcslam.errors import UnavailableError as UnavailableError
+from fcslam.live.fleet_view import FleetView as FleetView
 from fcslam.live.localized_robot import LocalizedRobot as LocalizedRobot
 from fcslam.live.records import EventKind as EventKind
 from fcslam.live.records import LocalizationState as LocalizationState
@@ -63,6 +64,10 @@ from fcslam.sources import Faults as Faults
 from fcslam.sources import Source as Source
 from fcslam.sources import Survey as Survey
 from fcslam.sources.point_clouds import CloudBand as CloudBand
+from fcslam.wire.fleet_replies import FrontierReply as FrontierReply
+from fcslam.wire.fleet_replies import MapFrontiers as MapFrontiers
+from fcslam.wire.fleet_replies import QualityReply as QualityReply
+from fcslam.wire.fleet_replies import TeammatePose as TeammatePose
 from fcslam.wire.keys import Server as Server
 
 __version__: str
