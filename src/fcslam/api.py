@@ -208,7 +208,8 @@ def notes_in_space(recordings: Sequence[Source], settings: MissionConfig) -> lis
     if settings.fleet.dimensions == 2:
         return []
     unused = settings.robot.unused_in_space if any(map(sources.is_whole, recordings)) else ""
-    return [*filter(None, (sources.planar_note(recordings), unused))]
+    planar = ", ".join(source.name for source in recordings if not sources.is_whole(source))
+    return [*filter(None, (planar and sources.IN_PLANE.format(planar), unused))]
 
 
 def split_recordings(recordings: list[Source], parts: int) -> list[Source]:

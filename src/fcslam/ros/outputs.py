@@ -187,24 +187,23 @@ class Outputs:
 
         ``own`` is the index of the robot's own map; None: no pose is in its frame.
         """
-        near = [mate for mate in teammates if mate.map_index == own]
-        poses = [self._codec.pose(in_space(np.array(mate.T_map_base))) for mate in near]
+        near = [mate.T_map_base for mate in teammates if mate.map_index == own]
+        poses = [self._codec.pose(in_space(np.array(T_map_base))) for T_map_base in near]
         header = self._codec.header(now_ns, self._map_frame)
         self._send(FLEET_POSES, POSES, self._codec.make(POSES, header=header, poses=poses))
-        for mate in near:
-            topic = _pose_topic(mate.robot)
-            if len(self._teammates) < MOST_TEAMMATES:
-                self._teammates.setdefault(topic, mate.robot)
-            if self._teammates.get(topic) == mate.robot:
-                stamp_ns = max(0, now_ns - nanoseconds(mate.age_s))
-                self._send(topic, POSE_STAMPED, self._posed(stamp_ns, np.array(mate.T_map_base)))
         statuses = []
         for mate in teammates:
+            topic, is_near = _pose_topic(mate.robot), mate.map_index == own
+            if is_near and len(self._teammates) < MOST_TEAMMATES:
+                self._teammates.setdefault(topic, mate.robot)
+            owner = self._teammates.get(topic)
+            if is_near and owner == mate.robot:
+                stamp_ns = max(0, now_ns - nanoseconds(mate.age_s))
+                self._send(topic, POSE_STAMPED, self._posed(stamp_ns, np.array(mate.T_map_base)))
             values: dict[str, object] = {"map": mate.map_index, "floor": mate.floor, "age_s": f"{mate.age_s:.2f}"}
             values |= {axis: f"{at:.4f}" for axis, at in zip(("x", "y", "theta"), mate.T_map_base, strict=True)}
             name, where, level = f"robot {mate.robot}", f"map {mate.map_index}", self._levels.OK
-            owner = self._teammates.get(topic := _pose_topic(mate.robot), mate.robot)
-            if owner != mate.robot:  # as r-2 and r_2
+            if owner not in (None, mate.robot):  # as of r-2 and r_2
                 where, level = f"{where}; {topic} has the poses of {owner}: rename one of both", self._levels.WARN
             statuses.append(self._status(name, mate.robot, level, where, values))
         self._diagnose(FLEET_STATUS, now_ns, statuses)

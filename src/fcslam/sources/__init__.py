@@ -9,7 +9,6 @@ from fcslam.sources.formats import IN_PLANE as IN_PLANE
 from fcslam.sources.formats import is_whole as is_whole
 from fcslam.sources.formats import open_fleet as open_fleet
 from fcslam.sources.formats import open_source as open_source
-from fcslam.sources.formats import planar_note as planar_note
 from fcslam.sources.formats import whole_clouds as whole_clouds
 from fcslam.sources.source import Source as Source
 from fcslam.sources.source import Survey as Survey

@@ -1,7 +1,7 @@
 """The known formats of recordings, and opening a recording by its content."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,12 +57,6 @@ def is_whole(source: Source) -> bool:
     from fcslam.sources.clouds_in_space import CloudRecording
 
     return isinstance(source, CloudRecording)
-
-
-def planar_note(sources: Sequence[Source]) -> str:
-    """What robots without clouds do in a map in space, one line; empty if all have clouds."""
-    planar = [source.name for source in sources if not is_whole(source)]
-    return IN_PLANE.format(", ".join(planar)) if planar else ""
 
 
 def bag_of(source: Source) -> "RosBag | None":
