@@ -92,5 +92,5 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
 def breakable(word: re.Match[str]) -> str:
     """A word of code in HTML: left alone, a browser breaks ``--option`` behind its hyphens, and a long path nowhere."""
     if len(word[0]) > LONGEST_WORD and not word[0].startswith("-"):
-        return re.sub(r"[/_.|](?=\w\w)", r"\g<0><wbr>", word[0])
+        return re.sub(r"(?<!\d)[/_.|](?=\w\w)", r"\g<0><wbr>", word[0])
     return f'<span class="word">{word[0]}</span>' if "-" in word[0] else word[0]
