@@ -121,7 +121,7 @@ def test_fixes_that_are_too_few_to_check_each_other_place_nothing():
     result, true = mapped()
     placing = placed(fixed(result, fixes_of(true, (35.0, -20.0, 0.7), 0.05)[::9][:3]))
     (line,) = (line for line in anchoring_lines(placing.files) if "earth" in line)
-    assert line.endswith("3 fixes do not show which are wrong, 10 needed; drive farther outdoors")
+    assert line.endswith("3 of 3 fixes agree, 10 needed: fewer do not show which are wrong")
 
 
 def test_fixes_that_leave_the_heading_open_place_nothing():

@@ -164,10 +164,8 @@ def _needed(count: int) -> int:
 
 def _refusal(measured: _Measured, T: FloatArray, antennas: FloatArray, agreeing: NDArray[np.bool_]) -> str:
     count, sigmas_m = int(agreeing.sum()), measured.sigma_m
-    if len(agreeing) < LEAST_FIXES:
-        return f"{len(agreeing)} fixes do not show which are wrong, {LEAST_FIXES} needed; drive farther outdoors"
-    if count < _needed(len(agreeing)):
-        return f"{count} of {len(agreeing)} fixes agree, {_needed(len(agreeing))} needed"
+    if count < (needed := _needed(len(agreeing))):
+        return f"{count} of {len(agreeing)} fixes agree, {needed} needed: fewer do not show which are wrong"
     if measured.factor > 1.0 and np.median(sigmas_m) > MOST_SPREAD * np.hypot(*antennas.std(axis=0)):
         return f"the fixes differ by {np.median(sigmas_m):.1f} m from the path of the robots"
     at = measured.xy[agreeing] - measured.xy[agreeing].mean(axis=0)

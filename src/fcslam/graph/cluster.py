@@ -323,7 +323,8 @@ def maximum_clique(adjacent: NDArray[np.bool_], node_budget: int = NODE_BUDGET) 
         return [], True
     matrix = matrix & ~np.eye(size, dtype=bool)
     order = np.argsort(-matrix.sum(axis=1), kind="stable")
-    neighbours = [_to_bits(row) for row in matrix[np.ix_(order, order)]]
+    rows = np.packbits(matrix[np.ix_(order, order)], axis=1, bitorder="little")
+    neighbours = [int.from_bytes(row.tobytes(), "little") for row in rows]
     best, exact = _search(neighbours, min(node_budget, VERTEX_BUDGET // size))
     return sorted(int(order[vertex]) for vertex in _bits(best)), exact
 
@@ -363,10 +364,6 @@ def _coloured(vertices: int, neighbours: list[int]) -> list[tuple[int, int]]:
             vertices &= ~(1 << vertex)
             free &= ~(neighbours[vertex] | (1 << vertex))
     return result
-
-
-def _to_bits(row: NDArray[np.bool_]) -> int:
-    return int.from_bytes(np.packbits(row, bitorder="little").tobytes(), "little")
 
 
 def _bits(vertices: int) -> Iterator[int]:
