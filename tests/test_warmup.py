@@ -119,3 +119,29 @@ def test_after_the_warm_up_a_robot_finds_all_its_code_compiled():
         [sys.executable, "-c", COMPILED + TRACKING], cwd=root, capture_output=True, text=True, check=True
     )
     assert json.loads(done.stdout) == [True, True, 2, True]
+
+
+SPACE = """
+from fcslam.lidar3d.voxel_matching import prepared
+from fcslam.records import VoxelMap
+from fcslam.robot.backend import SessionConfig
+from fcslam.robot.frontend3d import RobotFrontend3d
+from fcslam.warmup import warm_up_space
+from tests.spinning_lidar import circle, drive, room
+
+warm_up_space()
+warm = compiled()
+robot, scans = RobotFrontend3d("r", SessionConfig()), drive(room(1), circle((6.0, 4.0), 1.6, 0.8), 90, azimuths=120)
+bodies = [packet.body for scan, _ in scans for packet in robot.process(scan)]
+maps = [prepared(body) for body in bodies if isinstance(body, VoxelMap)]
+print(json.dumps([len(maps) > 0, all(each.free.any() for each in maps), warm == compiled()]))
+"""
+
+
+@pytest.mark.slow
+def test_after_the_warm_up_a_robot_in_space_and_its_fleet_find_all_their_code_compiled():
+    root = Path(__file__).parents[1]
+    done = subprocess.run(
+        [sys.executable, "-c", COMPILED + SPACE], cwd=root, capture_output=True, text=True, check=True
+    )
+    assert json.loads(done.stdout) == [True, True, True]

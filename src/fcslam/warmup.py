@@ -41,6 +41,7 @@ from fcslam.records import (
     LaserScan,
     Ranges,
     Sweep,
+    VoxelMap,
     frozen,
 )
 from fcslam.robot.backend import OwnPlaces
@@ -102,8 +103,9 @@ def warm_up_tracking(config: RobotConfig) -> None:
 
 
 def warm_up_space() -> None:
-    """Compile what a robot with a 3D LiDAR needs."""
-    from fcslam.robot.frontend3d import RobotFrontend3d  # robots with 2D LiDARs have no use for it
+    """Compile what robots with 3D LiDARs and their fleet need beside the code of other robots."""
+    from fcslam.lidar3d.voxel_matching import prepared  # robots with 2D LiDARs have no use for these
+    from fcslam.robot.frontend3d import RobotFrontend3d
 
     robot = RobotFrontend3d("r", RobotConfig())
     for record in made_up_turns(_STEPS):
@@ -111,6 +113,8 @@ def warm_up_space() -> None:
             measure(packet)
     for packet in robot.finish():
         measure(packet)
+        if isinstance(packet.body, VoxelMap):
+            assert prepared(packet.body).free.any()
 
 
 def warm_up_decoding() -> None:
@@ -140,12 +144,12 @@ def is_cold() -> bool:
 
 
 @contextmanager
-def compiling(processes: int) -> Iterator[Sequence[Background]]:
-    """Run the warm-up of the first scans, then the others beside this block, in copies of this process.
+def compiling(processes: int, runs: Sequence[Callable[[], None]] = WARM_UPS) -> Iterator[Sequence[Background]]:
+    """Run the first of the warm-ups, then the others beside this block, in copies of this process.
 
     The copies fill the cache and end with the context. Without a cache or copies, the rest is compiled when needed.
     """
-    first, *others = WARM_UPS
+    first, *others = runs
     first()
     count = 0 if uncached() else min(processes - 1, len(others))
     copies = [start_copy(partial(_compile, others[k::count]), niceness=0) for k in range(count)]

@@ -8,7 +8,8 @@ import pytest
 from fcslam.geometry import se3
 from fcslam.lidar3d.surfels import SurfelMap
 from fcslam.lidar3d.tracker import Tracker3d, fit_rigid
-from tests.spinning_lidar import circle, drive, room
+from fcslam.records import CloudScan
+from tests.spinning_lidar import ORIGIN, circle, drive, room
 
 CORRIDOR = np.array(
     [
@@ -48,6 +49,17 @@ def test_a_plain_corridor_says_nothing_along_its_axis_and_wheels_hold_it() -> No
     scan, _ = next(drive(CORRIDOR, lambda t: np.array([2.0 + 0.5 * t, 0.0, 0.0]), 1))
     information = tracker.track(replace(scan, stamp=4.0, wheels=scan.wheels + np.array([4.0, 0.0, 0.0, 0.0]))).measured
     assert information[0, 0] < 1e-3 * information[1, 1]
+
+
+def test_wheels_hold_roll_and_pitch_where_few_rings_show_little_floor() -> None:
+    def every_second_ring(scan: CloudScan) -> CloudScan:
+        x, y, z = (scan.points_m - ORIGIN).T
+        kept = np.rint(np.degrees(np.arctan2(z, np.hypot(x, y))) + 15.0) % 4.0 == 0.0
+        return replace(scan, points_m=scan.points_m[kept], times_s=scan.times_s[kept])
+
+    turns = drive(CORRIDOR, lambda t: np.array([0.7 * t, 0.0, 0.0]), 25, azimuths=240, noise_m=0.015)
+    found = errors(Tracker3d(), ((every_second_ring(scan), pose) for scan, pose in turns))
+    assert np.degrees(np.abs(found[:, 3:5])).max() < 0.5, "the floor between two turns has the error of their poses"
 
 
 def test_wheels_hold_a_robot_that_stops_in_a_plain_corridor_while_its_lidar_pauses() -> None:

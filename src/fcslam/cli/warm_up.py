@@ -21,17 +21,18 @@ FIRST_SCANS_S, EVERYTHING_S = 15, 60
 
 def warm_up() -> None:
     """Compile the code of robots and cloud now, on all cores, so that the first run starts at once."""
-    from fcslam.warmup import WARM_UPS, compiling
+    from fcslam.warmup import WARM_UPS, compiling, warm_up_space
 
     console = notices()
     if report_uncached(console):
         return
     print_line(console, f"compiling, about {EVERYTHING_S} s on one core")
+    runs = *WARM_UPS, warm_up_space
     if cores() == 1:
-        for run in WARM_UPS:
+        for run in runs:
             run()
     else:
-        with compiling(cores() + 1) as copies:  # this process waits most of the time
+        with compiling(cores() + 1, runs) as copies:  # this process waits most of the time
             for copy in copies:
                 copy.join()
     print_line(console, "the code is compiled")

@@ -23,8 +23,9 @@ _WHEELS: Final = OdometryModel(
     position_m=0.005, position_per_travel=0.1, position_per_turn_m=0.02, heading_rad=0.01, heading_per_turn=0.2
 )
 """Model of the error of wheels during a turn of the LiDAR, a few centimetres of travel."""
-_TILT_RAD: Final = 0.03
-"""Standard deviation of roll and pitch, which wheels do not measure; heights are as certain as positions."""
+_TILT_RAD, _TILT_PER_M = 1e-3, 0.02
+"""Standard deviation of roll and pitch, which wheels do not measure: of a turn of the LiDAR, and per metre, as a floor
+bends under a robot that drives. Heights are as certain as positions."""
 _GYRO_RAD, _GYRO_SHARE = 1e-3, 0.01
 """Standard deviation of a rotation by gyro: of a turn of the LiDAR, and per radian."""
 _AT_REST: Final = 1e-3
@@ -75,7 +76,8 @@ class MotionSensors:
             turns = np.column_stack((np.zeros((len(steps), 2)), steps[:, 2]))
             moved_m = float(np.hypot(*planar[:2]))
             error = self.trust.scale(odometry_error(moved_m, abs(planar[2]), _WHEELS))
-            sigma = np.array([*3 * [error.position_m], *2 * [_TILT_RAD], error.heading_rad])
+            tilt_rad = _TILT_RAD + _TILT_PER_M * moved_m
+            sigma = np.array([*3 * [error.position_m], *2 * [tilt_rad], error.heading_rad])
         if covers(self._imu, times):
             turned = integral(self._imu[:, 0], self._imu[:, 1:4], times)
             rotation = turned[-1]
