@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fcslam.geometry import se2, se3
+from fcslam.lidar3d import tracker
 from fcslam.live.records import Wiring
 from fcslam.live.robot import Robot
 from fcslam.records import CloudScan, Constraint, ConstraintKind, Keyscan, Place, VoxelMap
@@ -117,6 +118,19 @@ def test_a_clock_that_steps_back_begins_a_session() -> None:
     packets += robot.finish()
     assert [len(track) for track in robot.tracks] == [4, 4]
     assert [packet.epoch for packet in packets if isinstance(packet.body, Hello)] == [0, 1]
+
+
+@pytest.mark.parametrize(("put_down_in", "sessions"), [(1, 1), (2, 2)])
+def test_a_robot_is_lost_in_another_room_and_not_where_more_points_miss_their_surface(
+    monkeypatch: pytest.MonkeyPatch, put_down_in: int, sessions: int
+) -> None:
+    def turns(seed: int, count: int) -> list[CloudScan]:
+        there = drive(room(seed, (12.0, 8.0 * seed)), circle((6.0, 4.0), 0.8, 0.4), count, azimuths=120)
+        return [scan for scan, _ in there]
+
+    monkeypatch.setattr(tracker, "_POOR_LEAST", -1.0 if put_down_in == 1 else tracker._POOR_LEAST)
+    robot, _ = driven_by([*turns(1, 40), *turns(put_down_in, 90)[40:]])
+    assert len(robot.tracks) == sessions
 
 
 @pytest.mark.parametrize(("moved_m", "scans"), [(0.0, [8]), (17.0, [4, 4])])

@@ -1,5 +1,6 @@
 """Keyframes of a robot with a 3D LiDAR, the motions between them, and local maps of several keyframes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -11,6 +12,7 @@ from fcslam.geometry.voxels import VOXEL_STEPS, to_steps, voxelised
 from fcslam.lidar3d.ground import Vertical, levelled
 from fcslam.lidar3d.surfels import SurfelMap
 from fcslam.lidar3d.tracker import MOST_POINTS, Tracked, fit_rigid, inverse, thinned
+from fcslam.lidar3d.voxel_matching import PreparedMap, show_one_place
 from fcslam.records import STEP_M, FloatArray, KeyscanId, VoxelMap
 from fcslam.sources.clouds_in_space import floor_at
 
@@ -162,6 +164,11 @@ class SurfaceMaps:
             return None
         return self._around(anchor)
 
+    def show_place_of(self, turns: Sequence[Tracked]) -> bool:
+        """Whether the newest keyframes and the turns after them show one place, so that the robot is not lost."""
+        T_odom_base = turns[0].T_odom_base
+        return show_one_place(_prepared(self.recent, T_odom_base), _prepared(turns, T_odom_base))
+
     def finish(self) -> SurfaceMap | None:
         """The last local map of a drive, if the newest keyframes are in none."""
         rest = [each for each in self.recent if each.travel_m >= self._next_m]
@@ -199,6 +206,16 @@ class SurfaceMaps:
             if apart_m > _APART_M and distance_m < _NEAR_M + _DRIFT_SHARE * apart_m:
                 near.append((distance_m, old.anchor.number, old))
         return [old for _, _, old in sorted(near, key=lambda each: each[:2])[:_MOST_TRIED]]
+
+
+def _prepared(turns: Sequence[MappedTurn | Tracked], T_odom_base: FloatArray) -> PreparedMap:
+    """The points of several turns in ``base`` of one of them, ready to be compared."""
+    T_base = [se3.between(T_odom_base, each.T_odom_base) for each in turns]
+    points = [se3.transform(T, each.points) for T, each in zip(T_base, turns, strict=True)]
+    origins = [se3.transform(T, each.origin[None]) for T, each in zip(T_base, turns, strict=True)]
+    joined = np.concatenate(points)
+    kept = thinned(joined, _CELL_M)
+    return PreparedMap(joined[kept], np.repeat(np.concatenate(origins), [len(each) for each in points], axis=0)[kept])
 
 
 def wall_columns(local: VoxelMap) -> FloatArray:

@@ -6,6 +6,7 @@ gyro hold those directions in which the surfaces say little: information about a
 could make is taken away.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -117,6 +118,14 @@ class Tracker3d:
                 self._register(first)
                 tracked = self._register(scan)
         return tracked
+
+    def accept(self, turns: Sequence[Tracked]) -> None:
+        """Add turns to the map that it explained badly: they are right, but much that they see is new."""
+        points = [se3.transform(each.T_odom_base, each.points) for each in turns]
+        origins = [se3.transform(each.T_odom_base, each.origin[None]) for each in turns]
+        rays = [seen - origin for seen, origin in zip(points, origins, strict=True)]
+        self._map.add(np.concatenate(points), np.concatenate(rays), self._travel + 1e-9 * self._turns)
+        self._inserted = self._travel
 
     def _register(self, scan: CloudScan) -> Tracked:
         distances = np.linalg.norm(scan.points_m - scan.origin_m.astype(np.float32), axis=1)

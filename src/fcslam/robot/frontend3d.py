@@ -156,19 +156,24 @@ class RobotFrontend3d:
     def _begin(self, track: ScanTrack) -> None:
         self.tracks.append(track)
         self._tracker, self._keyframes, self._local_maps = Tracker3d(), Keyframes(), SurfaceMaps()
-        self._poor = 0
+        self._poor: list[Tracked] = []
+        """The newest turns, if the surfaces explain them badly."""
         self._certain_s = -np.inf
         self._before = None
 
     def _track(self, scan: CloudScan) -> None:
         tracked = self._tracker.track(scan)
         self.lacks_odometry = not len(scan.wheels)
-        self._poor = self._poor + 1 if tracked.is_poor else 0
-        if self._poor > SETTLED:  # the surfaces do not explain where it is any more
-            self.scan_poses.cut(self._certain_s)
-            self.begin_session()
-            self._before = scan
-            tracked = self._tracker.track(scan)
+        self._poor = [*self._poor, tracked] if tracked.is_poor else []
+        if len(self._poor) > SETTLED:
+            if self._local_maps.show_place_of(self._poor):
+                self._tracker.accept(self._poor)
+                self._poor = []
+            else:  # the surfaces do not explain where it is any more
+                self.scan_poses.cut(self._certain_s)
+                self.begin_session()
+                self._before = scan
+                tracked = self._tracker.track(scan)
         if not self._poor:
             self._certain_s = scan.stamp
         self.packets.advance(scan.stamp)
