@@ -88,6 +88,18 @@ def test_accuracy_names_the_place_and_the_drive_that_helps():
     assert replace(PAIR, quality=b"").verdict[0].concerns[0].why == "its accuracy is not known"
 
 
+def test_a_length_that_nothing_shows_has_no_number():
+    (unknown,) = run_of(drive("a"), said=certificate(10.0)).verdict
+    assert unknown.use is Use.WAIT
+    assert "its length around (4.5, 0.5) is not known, as neither wheels nor scans show it" in str(unknown)
+    assert not any("accurate" in line for line in unknown.details)
+
+
+def test_what_a_recording_says_against_a_map_counts():
+    (verdict,) = run_of(drive("a"), said=certificate(doubts=["anna: a ramp"])).verdict
+    assert (verdict.use, str(verdict)) == (Use.WAIT, "do not use this map yet: anna: a ramp")
+
+
 def test_a_robot_that_is_apart_is_a_reserve_of_both_maps():
     first, second = run_of(drive("a"), drive("b", 1)).verdict
     assert str(first) == (

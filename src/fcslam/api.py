@@ -21,6 +21,7 @@ from fcslam.mission.mission import (
     MissionInputs,
     Watch,
     continued_config,
+    doubted,
     run_mission,
 )
 from fcslam.mission.mission_file import EMPTY, read_mission
@@ -97,6 +98,7 @@ def map_recordings(
         floors = {robot.name: floors for robot in robots if floors}
     inputs = MissionInputs(earlier, tuple(vetoes), floors, anchors)
     run = run_mission(robots, settings, progress or (lambda _: None), inputs, side_by_side(processes))
+    run = doubted(run, robots)
     if output is not None:
         run.save(output, force)
     return run

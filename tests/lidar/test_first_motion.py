@@ -8,8 +8,8 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.first_motion import first_sweep
+from fcslam.lidar.odometry import PREDICTED
 from fcslam.records import Sweep, frozen
-from fcslam.robot.predicted_motion import PREDICTED
 from tests.robot import spinning
 
 

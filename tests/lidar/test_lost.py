@@ -16,11 +16,10 @@ from fcslam.lidar.lost import (
     is_doubtful,
     is_lost,
 )
-from fcslam.lidar.odometry import WHEELS, OdometryTrust
+from fcslam.lidar.odometry import PREDICTED, WHEELS, OdometryTrust
 from fcslam.mission.mission import MissionConfig
 from fcslam.records import LaserModel, frozen
 from fcslam.robot.frontend import RobotFrontend
-from fcslam.robot.predicted_motion import PREDICTED
 from tests.lidar.worlds import LASER, box, drive, recording, ring, ring_drive, room
 from tests.robot.kidnapping import put_down
 

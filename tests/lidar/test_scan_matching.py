@@ -5,7 +5,8 @@ import pytest
 
 from fcslam.geometry import se2
 from fcslam.lidar.field import field_of
-from fcslam.lidar.matching import NARROW_SCALE_M, NEW_MOTION, POINT_SIGMA_M, match_scan
+from fcslam.lidar.matching import NARROW_SCALE_M, NEW_MOTION, POINT_SIGMA_M, match_scan, seen_information
+from fcslam.lidar.tracker import POINT_LIMIT, POINT_SPACING_M
 from tests.lidar.worlds import bare_scan, corridor, path, ring, ring_drive, room, scan_at
 
 NO_PRIOR = np.zeros((3, 3))
@@ -77,6 +78,28 @@ def test_a_corridor_is_fixed_across_and_held_by_the_prior_along(heading):
     values, vectors = np.linalg.eigh(found.information[:2, :2])
     assert abs(vectors[:, 0] @ along) > 0.99
     assert values[0] < 0.05 * values[1]
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.6])
+@pytest.mark.parametrize(("noise_m", "end_m"), [(0.005, np.inf), (0.03, np.inf), (0.01, 6.0)])
+def test_noise_of_normals_does_not_show_the_axis_of_a_bare_corridor(heading, noise_m, end_m):
+    rng = np.random.default_rng(2)
+    walls = corridor()
+    if np.isfinite(end_m):
+        walls = np.vstack((walls, path((end_m, -1), (end_m, 1))))
+    walls = se2.transform((0.0, 0.0, heading), walls.reshape(-1, 2)).reshape(-1, 4)
+    axis = np.array([np.cos(heading), np.sin(heading)])
+    poses = [np.array([*(k * axis), heading]) for k in np.linspace(-2, 2, 9)]
+    field = field_of([(scan_at(pose, walls, noise_m=noise_m, rng=rng), pose) for pose in poses])
+    truth = np.array([0.0, 0.0, heading])
+    scan = scan_at(truth, walls, noise_m=noise_m, rng=rng).thinned(POINT_SPACING_M, POINT_LIMIT)
+    found = match_scan(scan, field, truth, np.diag((100.0, 100.0, 100.0)))
+    seen = seen_information(scan, field, found)
+    assert found.information[:2, :2] @ axis @ axis > 0.0
+    if np.isfinite(end_m):
+        assert np.array_equal(seen, found.information)
+    else:
+        assert seen[:2, :2] @ axis @ axis < 0.1 * (found.information[:2, :2] @ axis @ axis)
 
 
 def test_the_information_predicts_the_cost():

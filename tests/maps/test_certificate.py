@@ -25,7 +25,7 @@ COUNT = 40
 BAR_M = 0.25 * QUIET * QUANTILE
 
 
-def chain(sigma_m=0.01, sigma_rad=0.002, open_from=None, closures=(), rng=None):
+def chain(sigma_m=0.01, sigma_rad=0.002, open_from=None, closures=(), rng=None, open_m=0.3):
     """A drive in a circle with one keyscan a metre; with ``rng``, its measurements have errors."""
     angles = 2.0 * np.pi * np.arange(COUNT) / COUNT
     radius = COUNT / (2.0 * np.pi)
@@ -33,7 +33,7 @@ def chain(sigma_m=0.01, sigma_rad=0.002, open_from=None, closures=(), rng=None):
     poses[:, 2] = (poses[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
     edges = []
     for i, j in [*zip(range(COUNT - 1), range(1, COUNT), strict=True), *closures]:
-        along = 0.3 if open_from is not None and open_from <= i < open_from + 8 and j == i + 1 else sigma_m
+        along = open_m if open_from is not None and open_from <= i < open_from + 8 and j == i + 1 else sigma_m
         sigma = np.array((along, sigma_m, sigma_rad))
         motion = se2.between(poses[i], poses[j])
         if rng is not None:
@@ -145,6 +145,18 @@ def test_a_closure_makes_cells_good_and_an_open_stretch_makes_them_bad():
     ]
     plain, closed, is_open = (one["good_share"] for one in certificates)
     assert closed > plain > is_open
+
+
+def test_a_length_that_neither_wheels_nor_scans_measure_is_not_known_unless_closures_tell_it():
+    unknown, told = (
+        certify(graph, [path(poses)], room(poses))
+        for graph, poses in (
+            chain(open_from=12, open_m=0.5),
+            chain(open_from=12, open_m=0.5, closures=[(i, i + 2) for i in range(10, 20)]),
+        )
+    )
+    assert unknown["error_95"] == unknown["within"]
+    assert told["error_95"] < 1.0
 
 
 def test_what_to_drive_again_brings_what_it_promises():

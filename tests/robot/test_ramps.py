@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from fcslam import map_recordings
 from fcslam.robot.calibrating import ramps_of
+from fcslam.runs import Use
 from fcslam.sources import open_source
 from fcslam.sources.point_clouds import CloudMounting, slopes_of
 from tests.sources.bag_messages import odom, quaternion, save, tf
@@ -52,6 +54,13 @@ def test_a_drive_over_a_ramp_is_named(tmp_path, first_m, last_m, end_s):
     source = bag_of(tmp_path, drive(first_m, last_m))
     said = f"{source.path}: the robot drives over a ramp between 2 s and {end_s} s, and a 2D map is wrong there; "
     assert ramps_of(source) == (said + "map with --3d",)
+
+
+@pytest.mark.slow
+def test_the_verdict_on_a_2d_map_counts_a_ramp(tmp_path):
+    verdict = map_recordings(bag_of(tmp_path, drive(1.0, 11.0)).path).verdict[0]
+    assert verdict.use is Use.WAIT
+    assert "drives over a ramp" in " ".join((str(verdict), *verdict.details))
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from fcslam.robot.calibrating import calibrated
 from fcslam.robot.frontend import RobotConfig, RobotFrontend
 from fcslam.sources import open_source
 from fcslam.sources.bags.codec import COMPRESSED_IMAGE
+from fcslam.sources.source import Doubt
 from tests.robot import spinning
 from tests.sources.bag_messages import CODECS, Said, header, odom, quaternion, save, scan, tf
 from tests.sources.clouds import plan_ranges, said
@@ -184,6 +185,11 @@ def test_a_scanner(tmp_path, its):
     said, error_m = outcome(save(tmp_path / "run.mcap", recording(its)))
     assert its.line in said
     assert its.line in WRONG or error_m < 0.005
+
+
+def test_ranges_that_are_not_in_metres_speak_against_the_map(tmp_path):
+    source = calibrated(open_source(save(tmp_path / "run.mcap", recording(SCANNERS["feet"]))), LidarConfig())
+    assert [type(note) for note in source.survey().notes if "may be feet" in note] == [Doubt]
 
 
 LASER = Scanner(turns_s=FAST)

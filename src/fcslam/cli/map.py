@@ -152,7 +152,7 @@ def map_sources(
     with _without_collection():
         from fcslam.cli.progress import ProgressDisplay
         from fcslam.mission.driving import side_by_side
-        from fcslam.mission.mission import run_mission
+        from fcslam.mission.mission import doubted, run_mission
 
         surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
         gc.freeze()
@@ -163,7 +163,7 @@ def map_sources(
         faults: dict[str, Faults] = {}
         known = sum(len(track.stamps) for track in inputs.onto.tracks.values())
         progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
-        run = run_mission(sources, settings, progress, inputs, side_by_side(cores()))
+        run = doubted(run_mission(sources, settings, progress, inputs, side_by_side(cores())), sources)
         display.start("writing")
         run.save(output, force)
     print_faults(console, faults)

@@ -44,6 +44,9 @@ SUBMAP_REACH_M = 5.0
 """Travel before and after its anchor that a submap covers."""
 POINT_INFORMATION_SHARE = 1.0 / CORRELATED
 """Share of the points' information that counts: errors of neighbouring points are correlated."""
+SCANS_ALONE_SHARE = 0.5
+"""The same without wheels, where the velocity in a sweep is estimated, too, and has taken its part of the information.
+With it, true errors are as large relative to the information as with wheels."""
 ODOMETRY_SIGMA_M = 0.01
 ODOMETRY_SIGMA_RAD = 0.5 * ODOMETRY_SIGMA_M
 """Constant part of the standard deviations of odometry between two keyscans that were matched, in metres and radians;
@@ -269,11 +272,12 @@ def motion_information(motion: FloatArray, tracked: TrackedScan, odometry: Odome
     moved, turned = math.hypot(x, y), abs(turn)
     sigma_m = ODOMETRY_SIGMA_M + SIGMA_PER_TURN * moved
     sigma_rad = ODOMETRY_SIGMA_RAD + SIGMA_PER_TURN * turned
+    share = POINT_INFORMATION_SHARE if odometry.is_measured else SCANS_ALONE_SHARE
     if not odometry.is_measured or not tracked.information.any():  # no wheels, or they may have slipped
         sigma_m, sigma_rad = odometry_error(moved, turned, odometry)
     floor_m, floor_rad = least_sigmas(moved, turned)
     return limited_information(
-        POINT_INFORMATION_SHARE * tracked.information,
+        share * tracked.information,
         float(tracked.T_local_base[2]),
         (sigma_m**-2, sigma_m**-2, sigma_rad**-2),
         (floor_m**2, floor_m**2, floor_rad**2),

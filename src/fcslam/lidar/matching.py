@@ -50,6 +50,9 @@ EXPLAINED_M = 0.10
 """Distance, in metres, up to which a point lies on its surface."""
 WIDE_SCALE_M = 5.0 * NARROW_SCALE_M
 """Scale of the robust loss at the first step, metres, if the guess is that of odometry."""
+SEEN_NATS = 0.5
+"""Log-likelihood that a scan loses at least where it is displaced in a direction that it sees: that of one standard
+deviation."""
 
 
 Diagonal = tuple[float, float, float]
@@ -115,6 +118,27 @@ def match_scan(
             prior_tail,
         )
     )
+
+
+def seen_information(scan: PointScan, field: SurfelField, match: ScanMatch) -> FloatArray:
+    """Information (3, 3) of a match, without a direction that the scan does not see, as the axis of a bare corridor.
+
+    There, noise of the normals makes the second derivative of the cost, and a scan that is displaced by
+    ``WIDE_SCALE_M`` fits as well. Returns in a row without a normal do not count: far along a wall, they repeat the
+    pattern of the beams.
+    """
+    weakest = np.linalg.eigh(match.information[:2, :2])[1][:, 0]
+    points = _Points(scan.points, scan.normals, scan.solitary, scan.origin, scan.times_s)
+    counts = scan.normals.any(axis=1) | scan.solitary
+    at, before, behind = (
+        _fit(points, match.T_field_base + np.append(shift_m * weakest, 0.0), np.zeros(3), field.arrays)[2][counts].sum()
+        for shift_m in (0.0, -WIDE_SCALE_M, WIDE_SCALE_M)
+    )
+    if at - max(before, behind) >= SEEN_NATS:
+        return match.information
+    seen = np.eye(3)
+    seen[:2, :2] -= np.outer(weakest, weakest)
+    return np.asarray(seen @ match.information @ seen)
 
 
 class _Points(NamedTuple):

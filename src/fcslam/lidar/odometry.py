@@ -48,6 +48,10 @@ class OdometryModel:
 
 WHEELS = OdometryModel()
 """Model of a robot with wheel odometry."""
+PREDICTED = OdometryModel(
+    is_measured=False, position_m=0.1, position_per_travel=0.5, heading_rad=0.1, heading_per_turn=0.5
+)
+"""Model without odometry: every scan is matched; a robot may brake or turn by so much within a tenth of a second."""
 
 
 class OdometryError(NamedTuple):

@@ -10,7 +10,7 @@ from fcslam.geometry import se2
 from fcslam.lidar.correlative import SearchWindow, search
 from fcslam.lidar.evidence import CLEAR, CLEAR_GAIN, FAR, LEAST_KNOWN, judged_by, over_steps, resolve
 from fcslam.lidar.field import CELL_M, SurfelField
-from fcslam.lidar.matching import FIXED, WIDE_SCALE_M, ScanMatch, match_scan
+from fcslam.lidar.matching import FIXED, WIDE_SCALE_M, ScanMatch, match_scan, seen_information
 from fcslam.lidar.odometry import FIRST_MATCHES, PRIOR_TAIL, OdometryError, OdometryModel, OdometryTrust, odometry_error
 from fcslam.lidar.scan import PointScan, point_scan
 from fcslam.records import FloatArray, LaserScan, Sweep
@@ -153,7 +153,10 @@ class ScanTracker:
         if match.explained < (UNSURE_SUPPORTED if self._is_unsure(error) else SUPPORTED):
             tracked = by_odometry._replace(T_local_base=T_local_guess, scan=points)
             return TrackingResult(tracked, predicted._replace(T_local_base=T_local_guess), match.explained, match.known)
-        tracked = TrackedScan(match.T_field_base, match.information, points, _corrected(scan.sweep, match.velocity))
+        information = match.information
+        if not self._odometry.is_measured:
+            information = seen_information(thinned, self._fields[0][0], match)
+        tracked = TrackedScan(match.T_field_base, information, points, _corrected(scan.sweep, match.velocity))
         # 5. A good match shows how far odometry can be trusted, and every match how likely scans are here.
         learns = _is_good(match, error) and not (contradicts or has_jumped)
         accepted = TrackerState(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fcslam.compiled import njit
 from fcslam.geometry import se3
-from fcslam.lidar.odometry import PRIOR_TAIL
+from fcslam.lidar.odometry import PREDICTED, PRIOR_TAIL, odometry_error
 from fcslam.lidar3d.motion import MotionSensors, Prediction
 from fcslam.lidar3d.surfels import POINT_SIGMA_M, SIZES_M, SurfelMap, corrected
 from fcslam.records import CloudScan, FloatArray
@@ -68,7 +68,7 @@ class Tracked(NamedTuple):
     motion: FloatArray
     """Motion since the turn before, shape (7,)."""
     motion_sigma: FloatArray
-    """Standard deviations of its prediction, shape (6,)."""
+    """Standard deviations of what other sensors say about it, shape (6,)."""
     is_poor: bool
     """Whether the surfaces explain the turn badly."""
 
@@ -173,7 +173,7 @@ class Tracker3d:
             scan.origin_m,
             back.T @ fit.measured @ back,
             since,
-            predicted.sigma,
+            self._motion_sigma(predicted, since),
             self._is_poor,
         )
 
@@ -229,6 +229,14 @@ class Tracker3d:
         motion = to_end.T @ np.diag(predicted.sigma**-2) @ to_end
         first, by_wheels = np.array([0.0, 0.0, 0.0, 0.0, tilt, 0.0]), predicted.planar is not None
         return _fit(self._map, points, shares, T_odom_begin, inverse(covariance), motion, first, by_wheels)
+
+    @staticmethod
+    def _motion_sigma(predicted: Prediction, motion: FloatArray) -> FloatArray:
+        """Without wheels, the same error of the velocity goes on from turn to turn: it says nothing of the position."""
+        if predicted.planar is not None:
+            return predicted.sigma
+        error = odometry_error(float(np.linalg.norm(motion[:3])), 0.0, PREDICTED)
+        return np.concatenate((np.full(3, error.position_m), predicted.sigma[3:]))
 
     def _insert(self, points: FloatArray, origin: FloatArray, motion: FloatArray) -> None:
         tangent = se3.log(motion)

@@ -22,6 +22,7 @@ from fcslam.graph.cholesky import find_structure, marginal_covariance
 from fcslam.graph.pose_graph import Edge, EdgeArrays, PoseGraph
 from fcslam.lidar.evidence import SIGMA_PER_TURN
 from fcslam.lidar.frontend import ODOMETRY_SIGMA_M
+from fcslam.lidar.odometry import PREDICTED
 from fcslam.maps.frontiers import frontiers
 from fcslam.maps.occupancy_map import OccupancyMap
 from fcslam.records import FloatArray
@@ -44,7 +45,8 @@ FEWEST_REDUNDANT: Final = 10
 LEAST_GAIN_M2: Final = 10
 """Area that another drive makes good, or that is unknown beyond an open edge of the map, at least."""
 UNKNOWN_INFORMATION: Final = 1e-4
-"""Information about the pose of keyscans that no edge connects with the first one."""
+"""Information about the pose of keyscans that no edge connects with the first one, and about a step along which neither
+wheels nor scans see."""
 _S: Final = np.array(((0.0, -1.0), (1.0, 0.0)))
 
 
@@ -111,7 +113,7 @@ def certify(
     places = covariances(graph, paths, measured)
     centres = _known_squares(occupancy)
     nearest = np.array([np.argmin(_distances(places.poses, centre)) for centre in centres], np.int64)
-    bound = QUANTILE * places.bend_m(WITHIN_M)
+    bound = np.minimum(QUANTILE * places.bend_m(WITHIN_M), WITHIN_M)
     is_good = bound <= bar_m
     cells = [
         {"x": round(x, 3), "y": round(y, 3), "bound_95": round(float(bound[k]), 4), "good": bool(is_good[k])}
@@ -140,7 +142,7 @@ def covariances(graph: PoseGraph, paths: Sequence[MappedPath], measured: PoseGra
     variables = np.concatenate([path.variables for path in paths])
     rows = np.full(len(graph), -1)
     rows[variables] = np.arange(len(variables))
-    part, chosen = _part(graph, poses, rows).arrays(), _sampled(poses)
+    part, chosen = _unseen_steps_open(_part(graph, poses, rows).arrays()), _sampled(poses)
     held, no_residual = np.arange(len(poses)) == 0, np.zeros((len(part.i), 3))
     jacobians = SE2.jacobians(no_residual, poses[part.i], poses[part.j])
     structure = find_structure(part.i, part.j, len(poses))
@@ -198,6 +200,23 @@ def _part(graph: PoseGraph, poses: FloatArray, rows: NDArray[np.int64]) -> PoseG
     for begin in np.flatnonzero(part.components() == np.arange(len(poses)))[1:].tolist():
         part.add_edge(Edge(0, begin, se2.between(poses[0], poses[begin]), UNKNOWN_INFORMATION * np.eye(3), True))
     return part
+
+
+def _unseen_steps_open(edges: EdgeArrays) -> EdgeArrays:
+    """The edges, with next to no information about the length of steps that the scans do not see without wheels.
+
+    The points say less of such a step than its prediction, by the motion before it. The prediction errs by the same
+    velocity from step to step, so the errors add up to the whole length, and no standard deviation bounds them.
+    """
+    covariance = np.linalg.inv(edges.information)
+    variance, axes = np.linalg.eigh(covariance[:, :2, :2])
+    length_m = np.hypot(*edges.T_i_j[:, :2].T)
+    predicted_m = PREDICTED.position_m + PREDICTED.position_per_travel * length_m
+    predicted_m += PREDICTED.position_per_turn_m * np.abs(edges.T_i_j[:, 2])
+    unseen = (edges.j == edges.i + 1) & (variance[:, 1] > 0.5 * predicted_m**2)
+    along = axes[unseen, :, 1]
+    covariance[unseen, :2, :2] += along[:, :, None] * along[:, None] / UNKNOWN_INFORMATION
+    return replace(edges, information=np.linalg.inv(covariance))
 
 
 def _sampled(poses: FloatArray) -> NDArray[np.int64]:

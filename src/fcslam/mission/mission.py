@@ -5,6 +5,7 @@ sources -> robot (LiDAR SLAM, features) -> packets -> cloud (places -> graph -> 
 
 import heapq
 import itertools
+import json
 import logging
 import math
 from collections import Counter
@@ -36,6 +37,7 @@ from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.sources.contradictions import count_returns
 from fcslam.sources.faults import Faults
+from fcslam.sources.source import Doubt
 from fcslam.wire.ledger import Ledger
 from fcslam.wire.messages import Acknowledgement, Packet
 from fcslam.wire.packets import SizedPacket, measure
@@ -136,6 +138,18 @@ def run_mission(
             live(cloud)
     meter.report(fusing=True)
     return cloud.run(meter.tracks, meter.scans)
+
+
+def doubted(run: Run, sources: Sequence[Source]) -> Run:
+    """The run, with what the recordings of each robot say against a map in its certificate."""
+    doubts = {each.name: [note for note in each.survey().notes if isinstance(note, Doubt)] for each in sources}
+    if not any(doubts.values()) or not run.quality:
+        return run
+    certificates = json.loads(run.quality)
+    for index, certificate in certificates.items():
+        members = {robot_of(its.robot): None for its in run.trajectories.values() if str(its.map_index) == index}
+        certificate["doubts"] = [doubt for robot in members for doubt in doubts.get(robot, ())]
+    return replace(run, quality=json.dumps(certificates, separators=(",", ":")).encode())
 
 
 class MissionCloud:

@@ -14,11 +14,12 @@ from fcslam.lidar.calibration import Estimate, MotionCalibration, OdometryTrack,
 from fcslam.lidar.facing import AS_STATED, MOST_COMPARED, Contradiction, contradicted_facing
 from fcslam.lidar.frontend import LidarConfig, LidarFrontend
 from fcslam.lidar.leaning import floor_line
+from fcslam.lidar.odometry import PREDICTED
 from fcslam.lidar.own_body import SAME_M, body_radius_m, body_sectors
 from fcslam.lidar3d.ground import seen_by
 from fcslam.records import Beams, CloudScan, FloatArray, LaserModel, LaserScan, Odometry, SensorRecord, Sweep
 from fcslam.robot.mapped_scans import MappedScans
-from fcslam.robot.predicted_motion import PREDICTED, PredictedMotion
+from fcslam.robot.predicted_motion import PredictedMotion
 from fcslam.robot.wheel_odometry import is_jump
 from fcslam.sources.bags.options import BagCorrection
 from fcslam.sources.clouds_in_space import BAND_LASER
@@ -27,7 +28,7 @@ from fcslam.sources.formats import bag_of, is_whole
 from fcslam.sources.motion import OdometryUpdates
 from fcslam.sources.pose import pose_of
 from fcslam.sources.returns import FloorLine
-from fcslam.sources.source import Derived, Source, Survey
+from fcslam.sources.source import Derived, Doubt, Source, Survey
 
 if TYPE_CHECKING:
     from fcslam.sources.bags.rosbag import RosBag
@@ -173,10 +174,9 @@ def ramps_of(source: Source) -> tuple[str, ...]:
     if not stamps:
         return ()
     begin_s, end_s = (stamp - bag.plan.lasers[0].first.stamp for stamp in (min(stamps), max(stamps)))
-    return (
-        f"{bag.path}: the robot drives over a ramp between {begin_s:.0f} s and {end_s:.0f} s, and a 2D map is wrong "
-        "there; map with --3d",
-    )
+    between = f"between {begin_s:.0f} s and {end_s:.0f} s"
+    wrong = "and a 2D map is wrong there; map with --3d"
+    return (Doubt(f"{bag.path}: the robot drives over a ramp {between}, {wrong}"),)
 
 
 def _scans_of(laser: LaserModel, source: Source) -> Iterator[LaserScan]:
@@ -243,7 +243,8 @@ def _scale_lines(calibration: MotionCalibration, beams: Beams) -> Iterator[str]:
         return
     if _is_wrong(distance):
         unit = "" if _is_of_wheels(distance) else ", or the unit of the ranges, which may be feet"
-        yield _scale_line("distance", distance, f"correct the radius of the wheels in its driver{unit}")
+        line = _scale_line("distance", distance, f"correct the radius of the wheels in its driver{unit}")
+        yield Doubt(line) if unit else line
     if _is_wrong(turn):
         remedy = "correct the distance of the wheels in its driver"
         stated_deg = math.degrees(beams.span_rad + beams.angle_increment_rad)
@@ -281,7 +282,7 @@ def calibrated(source: Source, config: LidarConfig) -> Source:
     if radius_m > bag.options.cloud_band.body_radius_m:
         bag = bag.without_body(radius_m + SAME_M)
     found = calibrate_bag(bag, config)
-    lines = (*ramps_of(bag), *(f"{bag.path}: {line}" for line in found.lines))
+    lines = (*ramps_of(bag), *(type(line)(f"{bag.path}: {line}") for line in found.lines))  # a doubt stays one
     return bag.corrected(found.correction, lines) if lines else bag
 
 

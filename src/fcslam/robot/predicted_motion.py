@@ -11,16 +11,12 @@ from fcslam.lidar.first_motion import LONGEST_GAP_S, first_sweep
 from fcslam.lidar.frontend import LidarFrontend
 from fcslam.lidar.gyro import Gyro
 from fcslam.lidar.lost import SEEN_S, is_in_reach, is_unplaced, relocated
-from fcslam.lidar.odometry import OdometryModel
+from fcslam.lidar.odometry import PREDICTED
 from fcslam.lidar.tracker import TrackedScan, TrackingResult
 from fcslam.records import CameraImage, FloatArray, LaserScan, Sweep, frozen
 
 LEAST_SHARE, LARGEST_SHARE = 0.5, 3.0
 """Limits of the next motion as a share of the last one: intervals vary by dropped scans, but also by wrong stamps."""
-PREDICTED = OdometryModel(
-    is_measured=False, position_m=0.1, position_per_travel=0.5, heading_rad=0.1, heading_per_turn=0.5
-)
-"""Model without odometry: every scan is matched; a robot may brake or turn by so much within a tenth of a second."""
 InOdom = Callable[[TrackedScan], FloatArray]
 """Gives ``T_odom_base`` of a localized scan, shape (3,), in a frame without jumps."""
 Deferred = list[LaserScan | CameraImage]

@@ -99,7 +99,13 @@ def _verdict(run: RunTables, k: int, certificate: Mapping[str, Any] | None, apar
     members = [trajectory for trajectory in run.trajectories.values() if trajectory.map_index == k]
     names = {trajectory.robot for trajectory in members}
     joins = sorted((j for j in run.joins if {j.robot_i, j.robot_j} <= names), key=lambda join: join.places)
-    concerns = [*_of_paths(members), *_of_joins(run, joins), *_of_accuracy(certificate), *_of_separations(k, apart)]
+    concerns = [
+        *_of_paths(members),
+        *_of_recordings(certificate),
+        *_of_joins(run, joins),
+        *_of_accuracy(certificate),
+        *_of_separations(k, apart),
+    ]
     grave = list(Use)
     concerns.sort(key=lambda concern: -grave.index(concern.use))  # stable
     use = concerns[0].use if concerns else Use.USE
@@ -145,6 +151,10 @@ def _of_joins(run: RunTables, joins: list[Join]) -> Iterator[Concern]:
             yield Concern(Use.RESERVE, why, "check on the spot that both saw one place, or give --start")
 
 
+def _of_recordings(certificate: Mapping[str, Any] | None) -> Iterator[Concern]:
+    yield from (Concern(Use.WAIT, str(doubt)) for doubt in (certificate or {}).get("doubts", []))
+
+
 def _of_accuracy(certificate: Mapping[str, Any] | None) -> Iterator[Concern]:
     if certificate is None or certificate.get("good_share") is None:
         yield Concern(Use.RESERVE, "its accuracy is not known")
@@ -163,6 +173,8 @@ def _of_accuracy(certificate: Mapping[str, Any] | None) -> Iterator[Concern]:
             *where[0], *where[1], first["gain_m2"]
         )
     why = f"{len(bad)} of {len(cells)} m2 around {_place(where[-1])} may be off by more than {_centimetres(bar_m)}"
+    if worst["bound_95"] >= certificate["within"]:
+        why = f"its length around {_place(where[-1])} is not known, as neither wheels nor scans show it"
     yield Concern(Use.WAIT if error_m > MOST_BARS * bar_m else Use.RESERVE, why, remedy, where)
 
 
@@ -179,7 +191,8 @@ def _of_separations(k: int, apart: list[Separation]) -> Iterator[Concern]:
 def _facts(certificate: Mapping[str, Any] | None) -> tuple[str, str]:
     if certificate is None or certificate.get("error_95") is None:
         return "", ""
-    accuracy = f"accurate to {_centimetres(max(0.01, certificate['error_95']))} within {certificate['within']:g} m"
+    known = f"accurate to {_centimetres(max(0.01, certificate['error_95']))} within {certificate['within']:g} m"
+    accuracy = known if certificate["error_95"] < certificate["within"] else ""
     coverage, ends = f"{len(certificate['cells'])} m2 are known", certificate.get("open_ends", [])
     if ends:
         at = _place((ends[0]["x"], ends[0]["y"]))

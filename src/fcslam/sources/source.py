@@ -13,6 +13,10 @@ from fcslam.sources.path_summary import PathSummary
 from fcslam.sources.pose import UNKNOWN_POSE, pose_of, relative_pose
 
 
+class Doubt(str):
+    """A note that says that the map of the recording is wrong."""
+
+
 @dataclass(frozen=True, slots=True)
 class Survey:
     """Summary of a recording."""
