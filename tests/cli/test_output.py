@@ -45,7 +45,8 @@ def test_quiet_map_prints_its_answer_only(tmp_path, capsys):
 
 
 def test_the_last_lines_are_the_verdict_after_the_names_of_every_picture(tmp_path, capsys):
-    logs = [str(save(tmp_path / f"{name}.log", drive(scans))) for name, scans in (("a", 40), ("b", 19))]
+    drives = {"a": drive(40), "b": drive(19, start_stamp=200.0)}
+    logs = [str(save(tmp_path / f"{name}.log", lines)) for name, lines in drives.items()]
     assert main(["map", *logs, "-o", str(tmp_path / "run"), "--quiet"]) == 0
     lines = capsys.readouterr().out.splitlines()
     pictures = sorted((tmp_path / "run").glob("map*.png"))  # a map of few keyscans gets none
