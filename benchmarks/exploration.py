@@ -21,15 +21,8 @@ from fcslam.lab.simulation.drivable_space import obstacle_cells
 from fcslam.lab.simulation.floorplan import draw_floor_plan
 from fcslam.lab.simulation.options import Building
 from fcslam.lidar.occupancy import OccupancyConfig
-from fcslam.maps.frontiers import (
-    REACHED_M,
-    Explorer,
-    frontiers,
-    passable_cells,
-    path_lengths,
-    search_grid,
-    start_cells,
-)
+from fcslam.maps.exploration import REACHED_M, Explorer
+from fcslam.maps.frontiers import frontiers, passable_cells, path_lengths, search_grid, start_cells
 from fcslam.maps.occupancy_map import Occupancy, OccupancyMap
 
 FREE, OCCUPIED = int(Occupancy.FREE), int(Occupancy.OCCUPIED)
