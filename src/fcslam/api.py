@@ -98,7 +98,7 @@ def map_recordings(
         floors = {robot.name: floors for robot in robots if floors}
     inputs = MissionInputs(earlier, tuple(vetoes), floors, anchors)
     run = run_mission(robots, settings, progress or (lambda _: None), inputs, side_by_side(processes))
-    run = doubted(run, robots)
+    run = doubted(run, {robot.name: robot.survey() for robot in robots})
     if output is not None:
         run.save(output, force)
     return run

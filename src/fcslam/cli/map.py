@@ -154,16 +154,16 @@ def map_sources(
         from fcslam.mission.driving import side_by_side
         from fcslam.mission.mission import doubted, run_mission
 
-        surveys = [source.survey() for source in sources]  # refuses bad recordings before the work
+        surveys = {source.name: source.survey() for source in sources}  # refuses bad recordings before the work
         gc.freeze()
     gc.set_threshold(100_000, 50, 100)  # many small arrays and no cycles: looking for some costs a tenth of the time
-    print_notes(console, (note for survey in surveys for note in survey.notes))
+    print_notes(console, (note for survey in surveys.values() for note in survey.notes))
     began = time.perf_counter()
     with compiled(console), ProgressDisplay(console) as display:
         faults: dict[str, Faults] = {}
         known = sum(len(track.stamps) for track in inputs.onto.tracks.values())
-        progress = _watch(display, known + sum(survey.scan_count for survey in surveys), faults)
-        run = doubted(run_mission(sources, settings, progress, inputs, side_by_side(cores())), sources)
+        progress = _watch(display, known + sum(survey.scan_count for survey in surveys.values()), faults)
+        run = doubted(run_mission(sources, settings, progress, inputs, side_by_side(cores())), surveys)
         display.start("writing")
         run.save(output, force)
     print_faults(console, faults)

@@ -37,7 +37,7 @@ from fcslam.runs import Metric, Run, check_names
 from fcslam.sources import Source
 from fcslam.sources.contradictions import count_returns
 from fcslam.sources.faults import Faults
-from fcslam.sources.source import Doubt
+from fcslam.sources.source import Doubt, Survey
 from fcslam.wire.ledger import Ledger
 from fcslam.wire.messages import Acknowledgement, Packet
 from fcslam.wire.packets import SizedPacket, measure
@@ -140,9 +140,9 @@ def run_mission(
     return cloud.run(meter.tracks, meter.scans)
 
 
-def doubted(run: Run, sources: Sequence[Source]) -> Run:
-    """The run, with what the recordings of each robot say against a map in its certificate."""
-    doubts = {each.name: [note for note in each.survey().notes if isinstance(note, Doubt)] for each in sources}
+def doubted(run: Run, surveys: Mapping[str, Survey]) -> Run:
+    """The run, with what the recording of each robot says against its map in the map's certificate."""
+    doubts = {name: [note for note in survey.notes if isinstance(note, Doubt)] for name, survey in surveys.items()}
     if not any(doubts.values()) or not run.quality:
         return run
     certificates = json.loads(run.quality)
