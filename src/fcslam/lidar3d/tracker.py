@@ -27,9 +27,6 @@ MOST_POINTS: Final = 3000
 """Points that are registered: one for each of the smallest voxels, or for larger cells if there are more."""
 _GATES_M: Final = (0.4, 0.28, 0.2, 0.14, 0.1, 0.1, 0.1, 0.1, 0.1)
 """Largest distance of a point from its surface in each iteration."""
-_FREE_TILT: Final = np.diag([1.0, 1.0, 1.0, 0.05, 0.05, 1.0])
-"""What roll and pitch by wheels are multiplied by while gates are wide: where the floor bends, Gauss-Newton would stay
-at the prediction, of which the Student t distribution has its largest density."""
 _NEAR_SURFACE_M: Final = 0.5
 """Points nearer to a surface mostly lie on it if the registration is right."""
 _CORRELATED: Final = 0.25
@@ -272,9 +269,7 @@ def _fit(
         measured, trusted = without_noise(H[:6, :6] + H[6:, 6:] + H[:6, 6:] + H[6:, :6], noise)
         H, b = _CORRELATED * (trusted @ H @ trusted.T), _CORRELATED * (trusted @ trusted @ b)
         begin, motion = begin_information, motion_information
-        if by_wheels and gate_m > _GATES_M[-1]:
-            begin, motion = (_FREE_TILT @ information @ _FREE_TILT for information in (begin, motion))
-        elif by_wheels:
+        if by_wheels:
             begin, motion = _unslipped(begin, corrections[:6]), _unslipped(motion, corrections[6:] - corrections[:6])
         prior = np.block([[begin + motion, -motion], [-motion, motion]])
         step = np.linalg.solve(H + prior, -(b + prior @ corrections))
